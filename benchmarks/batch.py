@@ -21,7 +21,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs, load_config
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import assemble
 from rovgraph.graph.batch import DiveGraph, make_graph, make_values, solve
 from rovgraph.log import read_log
 from rovgraph.simulate import Truth, scenario, simulate
@@ -50,7 +50,7 @@ def graph_of(seconds: float, config: Config) -> tuple[DiveGraph, gtsam.Values]:
     with TemporaryDirectory() as folder:
         write_log(dive.log_frame, Path(folder) / "log.csv")
         log = read_log(Path(folder) / "log.csv")
-    smoother = BatchSmoother(initialise(log, config), log)
+    smoother = assemble(log, initialise(log, config))
     b = smoother.initial
     # gates are open: Levenberg-Marquardt has none
     sensors = {name: replace(instrument, gate_sd=None) for name, instrument in b.instruments.items()}

@@ -26,7 +26,7 @@ import pandas as pd
 from rovgraph.diagnosis import Evidence, statistics
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.estimators.smoother import assemble, smoothed
 from rovgraph.estimators.thesis import FILTERS, FilterJob, run_filters
 from rovgraph.estimators.thesis.processes import length
 from rovgraph.estimators.thesis.setup import prepare
@@ -191,7 +191,7 @@ def alarms(folder: Path) -> list[Pair]:
     """The verdict on a dive, and its alarms while it goes on."""
     dive, config = simulated("lawnmower", 1, falcon(), Choices(duration=120.0))
     log = Log.from_frame(dive.log_frame)
-    smoother = BatchSmoother(initialise(log, config), log)
+    smoother = assemble(log, initialise(log, config))
     best = smoother.optimum()
     assert isinstance(best, ChainOptimum)
     evidence = Evidence(smoother.initial, [smoothed(best, smoother.initial)], best.problem, best, [], log)

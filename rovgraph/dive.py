@@ -1,7 +1,7 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -25,23 +25,25 @@ from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.lasting import Rival
 from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.stretches import Searches
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.estimators.smoother import BatchSmoother, assemble, smoothed
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
-from rovgraph.process import give_back
+from rovgraph.process import stage
 from rovgraph.progress import Progress, no_progress
 from rovgraph.state import State
 from rovgraph.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
+
+
+Search = Callable[[ChainOptimum, Config, Sequence[Alarm]], tuple[list[UnstatedNoise], list[Rival]]]
 
 
 @dataclass(frozen=True)
@@ -113,32 +115,26 @@ def smooth(
     """
     log, frozen = without_frozen(log, config)
     log, gaps = without_attitude_gaps(log, config)
-    known = _Known(log, initialise(log, config), frozen, gaps, findings)
-    dive, best = _solve(known, estimate, progress)
+    solver = _Solver(log, initialise(log, config), frozen, gaps, findings, estimate, progress)
+    solver.solve()
     for search in (find_noise, find_errors) if config.graph.find_noise else ():
-        if not isinstance(best, ChainOptimum):
-            break
-        found, rivals = search(best, dive.initial.config, dive.alarms)
-        if found:
-            known = known.with_found(found, rivals, best.state, dive.estimates[0].trajectory)
-            del dive, best  # a long dive is not kept twice
-            dive, best = _solve(known, estimate, progress)
-    if isinstance(best, ChainOptimum):
-        best = best.without_what_is_at_hand()
-        give_back()
-        dive = _with_main(dive, variance_sources=_sources_where_largest(dive.estimates[0].trajectory, best))
-    return _saying(dive, known.found) if known.found else dive
+        if solver.is_taught_by(search):
+            solver.solve()
+    return solver.told()
 
 
-@dataclass(frozen=True)
-class _Known:
-    """A dive, and what its earlier solutions have revealed.
+@dataclass
+class _Solver:
+    """A dive that is solved, and solved again where its solution has revealed what was not believed.
 
     Attributes
     ----------
-    log, initial, frozen, gaps, findings : the dive
-    found, rivals : what is believed since, and what would explain it as clearly
-    states, before : of the solution before: State of its keyframes, and its track; None = there is none
+    log, frozen, gaps, findings, estimate, progress : the dive, and what is asked for
+    initial : how it begins, with what is believed
+    found, rivals : what was revealed, and what would explain it as clearly
+    before : the track that was smoothed before
+    estimates, left_out, statistics : of the newest solution
+    best : the optimum of its smoothed estimate, where a batch solver found it
     """
 
     log: Log
@@ -146,26 +142,78 @@ class _Known:
     frozen: list[FrozenStretch]
     gaps: list[AttitudeGap]
     findings: Sequence[Finding]
+    estimate: str
+    progress: Progress
     found: tuple[UnstatedNoise, ...] = ()
     rivals: tuple[Rival, ...] = ()
-    states: State | None = None
     before: Trajectory | None = None
+    estimates: list[Estimate] = field(default_factory=list)
+    left_out: dict[tuple[str, str], int] = field(default_factory=dict)
+    statistics: list[Statistic] = field(default_factory=list)
+    best: Optimum | None = None
 
-    def with_found(
-        self, found: Sequence[UnstatedNoise], rivals: Sequence[Rival], states: State, before: Trajectory
-    ) -> "_Known":
-        """The same, with what its newest solution has revealed."""
-        initial = self.initial
+    def solve(self) -> None:
+        """Estimate the dive as it is believed to be, from where the last optimum stands."""
+        states = None if self.best is None else self.best.state
+        self.estimates, self.best = [], None  # a long dive is not kept twice
+        batch = assemble(self.log, self.initial)
+        if states is not None and len(states) != len(batch.problem):  # stamps stand elsewhere than they did
+            states = None
+        if self.initial.config.graph.solver == "isam2":
+            solver = _isam2(batch, self.progress)
+            if self.estimate != "filtered":
+                self.best = solver.optimum()
+                self.estimates.append(smoothed(self.best, solver.initial))
+            if self.estimate != "smoothed":
+                self.estimates.append(solver.filtered())
+        else:
+            if self.estimate != "smoothed":
+                filtered, passed = _filtered(batch, self.progress)
+                self.estimates, states = [filtered], passed if states is None else states
+            batch = batch.without_covariances()
+            if self.estimate != "filtered":
+                self.progress("smoothing", 0.5)
+                self.best = batch.optimum(states)
+                self.estimates.insert(0, smoothed(self.best, self.initial))
+        self._judge(batch)
+
+    def _judge(self, batch: BatchSmoother) -> None:
+        """Figures of the verdict; sds cover where rivals put the track."""
+        self.left_out, best = _left_out(batch, self.frozen, self.gaps), self.best
+        revealed = [(one.sensor, one.cause) for one in reversed(self.found)]  # first what moves the track most
+        seen = self.frozen, self.log, self.gaps, self.left_out, self.findings, revealed, self.before, self.rivals
+        self.statistics = statistics(Evidence(self.initial, self.estimates, (best or batch).problem, best, *seen))
+        if best is not None and any(one.kind == "rivals" and one.severity for one in self.statistics):
+            self.estimates = [_covering(estimate, self.rivals, best) for estimate in self.estimates]
+        self.estimates.append(batch.dead_reckoning())
+
+    def is_taught_by(self, search: Search) -> bool:
+        """Whether a search finds in the optimum what was not believed; it is believed from now on."""
+        if not isinstance(self.best, ChainOptimum):
+            return False
+        found, rivals = search(self.best, self.initial.config, self.dive({}).alarms)
         for one in found:
-            initial = initial.believing(one.beliefs)
-        return replace(
-            self,
-            initial=initial,
-            found=(*self.found, *found),
-            rivals=(*self.rivals, *rivals),
-            states=states,
-            before=self.before or before,
-        )
+            self.initial = self.initial.believing(one.beliefs)
+        if found:
+            self.found, self.rivals = (*self.found, *found), (*self.rivals, *rivals)
+            self.before = self.before or self.estimates[0].trajectory
+        return bool(found)
+
+    def told(self) -> Dive:
+        """The dive, with what brings its variance, and what was found in it."""
+        more: dict[str, object] = {}
+        if isinstance(self.best, ChainOptimum):
+            more["variance_sources"] = _sources_where_largest(self.estimates[0].trajectory, self.best)
+        if self.found:
+            more["noise_found"] = [one.as_dict() for one in self.found]
+        assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
+        return replace(self.dive(more), initial=replace(self.initial, assumptions=assumptions))
+
+    def dive(self, more: Mapping[str, object]) -> Dive:
+        """As it is believed to be, with more in the summary of its main estimate."""
+        main, *others = self.estimates
+        main = replace(main, summary={**main.summary, **more})
+        return Dive([main, *others], self.initial, self.left_out, self.frozen, self.statistics)
 
 
 def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, object]:
@@ -174,49 +222,6 @@ def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, o
     keyframe = int(np.searchsorted(best.problem.time, track.time[np.argmax(variance)]))
     keyframe = min(keyframe, len(best.problem) - 1)
     return {"time_s": float(best.problem.time[keyframe]), "m2": variance_sources(best, keyframe)}
-
-
-def _with_main(dive: Dive, **more: object) -> Dive:
-    """The dive with more in the summary of its main estimate."""
-    main = dive.estimates[0]
-    return replace(dive, estimates=[replace(main, summary={**main.summary, **more}), *dive.estimates[1:]])
-
-
-def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Optimum | None]:
-    """The dive as it is believed to be, and the optimum of its smoothed estimate where a batch solver found it."""
-    initial, log = known.initial, known.log
-    batch = assemble(log, initial)
-    if known.states is not None and len(known.states) != len(batch.problem):  # stamps stand elsewhere than they did
-        known = replace(known, states=None)
-    if initial.config.graph.solver == "isam2":
-        solver = _isam2(batch, progress)
-        best = solver.optimum() if estimate != "filtered" else None
-        estimates = [] if best is None else [smoothed(best, solver.initial)]
-        if estimate != "smoothed":
-            estimates.append(solver.filtered())
-    else:
-        estimates, states, best = [], known.states, None
-        passed = _filter(batch, progress) if estimate != "smoothed" else None
-        batch.forget_motion_covariances()
-        if passed is not None:
-            estimates.append(passed.solve())
-            if states is None and not batch.time_offsets.lags:
-                states = passed.states()  # where the filter went is close by
-            passed = None  # of a long dive it is large
-        give_back()
-        if estimate != "filtered":
-            progress("smoothing", 0.5)
-            best = batch.optimum(states)
-            del states
-            estimates.insert(0, smoothed(best, initial))
-            give_back()
-    left_out = _left_out(batch, known.frozen, known.gaps)
-    revealed = [(one.sensor, one.cause) for one in reversed(known.found)]  # what moves the track most: errors that last
-    seen = known.frozen, log, known.gaps, left_out, known.findings, revealed, known.before, known.rivals
-    numbers = statistics(Evidence(initial, estimates, (best or batch).problem, best, *seen))
-    if any(one.kind == "rivals" and one.severity for one in numbers) and best is not None:
-        estimates = [_covering(estimate, known.rivals, best) for estimate in estimates]
-    return Dive([*estimates, batch.dead_reckoning()], initial, left_out, known.frozen, numbers), best
 
 
 def _covering(estimate: Estimate, rivals: Sequence[Rival], best: Optimum) -> Estimate:
@@ -228,19 +233,6 @@ def _covering(estimate: Estimate, rivals: Sequence[Rival], best: Optimum) -> Est
             d = (rival.p_n - best.state.p_n)[:, :2]
             cov_p[:, :2, :2] += d[:, :, None] * d[:, None, :]
     return replace(estimate, trajectory=replace(track, cov_p=cov_p))
-
-
-def _saying(dive: Dive, found: Sequence[UnstatedNoise]) -> Dive:
-    """A dive that says what noise was found in it."""
-    initial = replace(dive.initial, assumptions=[*(one.text for one in found), *dive.initial.assumptions])
-    return replace(_with_main(dive, noise_found=[one.as_dict() for one in found]), initial=initial)
-
-
-def assemble(log: Log, initial: InitialConditions, searches: Searches | None = None) -> BatchSmoother:
-    """All keyframes of a log and what lies between them; ``searches`` as of `BatchSmoother`."""
-    batch = BatchSmoother(initial, log, searches=searches or Searches())
-    give_back()
-    return batch
 
 
 def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[AttitudeGap]) -> dict[tuple[str, str], int]:
@@ -267,13 +259,16 @@ def _taken_as_exact(initial: InitialConditions) -> list[str]:
     )
 
 
-def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
+@stage
+def _filtered(batch: BatchSmoother, progress: Progress) -> tuple[Estimate, State | None]:
+    """The filtered estimate, and where it went, close by the optimum; None where stamps moved meanwhile."""
     filtering = partial(progress, "filtering")
-    if not batch.time_offsets.lags:
-        return replay(batch.problem, batch.initial, REINITIALISE_AT_S, filtering)
-    estimator = ErrorStateFilter(batch.initial, REINITIALISE_AT_S)
-    estimator.take(batch.log, filtering)  # learns how late stamps are while it goes on
-    return estimator
+    if batch.time_offsets.lags:
+        estimator = ErrorStateFilter(batch.initial, REINITIALISE_AT_S)
+        estimator.take(batch.log, filtering)  # learns how late stamps are while it goes on
+        return estimator.solve(), None
+    estimator = replay(batch.problem, batch.initial, REINITIALISE_AT_S, filtering)
+    return estimator.solve(), estimator.states()
 
 
 def _isam2(batch: BatchSmoother, progress: Progress) -> "IncrementalEstimator":

@@ -2,10 +2,14 @@
 
 import contextlib
 import ctypes
+import functools
 import gc
 import os
 import sys
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
+F = TypeVar("F", bound=Callable[..., Any])
 GARBAGE = 1_000_000  # objects made and not freed before the collector looks; Python's own is 700
 # bytes of an array that glibc maps by itself, so that it goes back to the system when it is freed: its own limit rises
 # to 32 MB, and much of what an hour's dive has freed stays with the process. The arrays of a dive of minutes may stay:
@@ -33,8 +37,16 @@ def be_frugal() -> None:
         os.environ.setdefault(name, count)
 
 
-def give_back() -> None:
-    """Let the system have what was freed below `MAPPED`: between tasks of which each makes very many objects."""
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)
+def stage(function: F) -> F:
+    """A stage of a dive: when it ends, the system has back what it freed below `MAPPED`."""
+
+    @functools.wraps(function)
+    def whole(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        finally:
+            if sys.platform == "linux":
+                with contextlib.suppress(OSError, AttributeError):
+                    ctypes.CDLL(None).malloc_trim(0)
+
+    return cast(F, whole)

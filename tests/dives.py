@@ -16,7 +16,7 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFi
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import BatchSmoother, assemble
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
@@ -145,7 +145,7 @@ def started(case: Simulated, **sections: Mapping[str, Any]) -> Config:
 
 def batch(log: Log, config: Config) -> BatchSmoother:
     """A batch smoother that has taken a whole log."""
-    return BatchSmoother(initialise(log, config), log)
+    return assemble(log, initialise(log, config))
 
 
 def incremental(log: Log, config: Config) -> IncrementalEstimator:

@@ -36,7 +36,7 @@ from rovgraph.dive import Dive, smooth
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import assemble
 from rovgraph.geometry import rotate, transpose
 from rovgraph.log import Log
 
@@ -135,7 +135,7 @@ def test_a_considered_mounting_that_is_turned_by_90_degrees_makes_the_dive_wrong
 @pytest.mark.parametrize(("name", "off"), [("dvl_scale", 0.02), ("dvl_pitch", 0.03), ("gyr_scale", 0.005)])
 def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
     case = simulated(falcon(), SECONDS, 2, calibration={name: off * np.ones(3 if name == "gyr_scale" else 1)})
-    best = BatchSmoother(initialise(case.log, case.config), case.log).optimum()
+    best = assemble(case.log, initialise(case.log, case.config)).optimum()
     assert isinstance(best, ChainOptimum)
     found = release(best, [name])
     mean = case.config.dvl.mount_rpy_deg[1] if name == "dvl_pitch" else 0.0
@@ -163,7 +163,7 @@ def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_rele
     steps = []
     for seed in range(1, 5):
         case = simulated(falcon(), 120.0, seed)
-        best = BatchSmoother(initialise(case.log, case.config), case.log).optimum()
+        best = assemble(case.log, initialise(case.log, case.config)).optimum()
         found = release(best, ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
         steps += [r.step / r.sd for r in found]
     assert len(steps) == 36

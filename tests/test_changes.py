@@ -17,7 +17,7 @@ from rovgraph.engine.lasting import LastingError, Rival
 from rovgraph.engine.widened_chain import lasting_belief
 from rovgraph.estimators.eskf.error_state import replay
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.estimators.smoother import assemble, smoothed
 from rovgraph.geometry import rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream
 
@@ -82,7 +82,7 @@ def changing(case):
     log = stepped(case.log, "fix", (6.0, -4.0))
     initial = initialise(log, case.config)
     belief = lasting_belief(initial.beliefs["fix_error"], 5.0, np.inf, (AT,))
-    dive = BatchSmoother(initial.believing(Beliefs({"fix_error": belief})), log)
+    dive = assemble(log, initial.believing(Beliefs({"fix_error": belief})))
     return dive, dive.optimum()
 
 
@@ -91,7 +91,7 @@ def test_what_changes_is_constant_before_and_after(case, changing):
     path, late = best.state.calibration["fix_error"], dive.problem.time >= AT
     assert np.ptp(path[~late], axis=0).max() < 0.01 and np.ptp(path[late], axis=0).max() < 0.01
     np.testing.assert_allclose(path[late][0] - path[~late][0], [6.0, -4.0], atol=0.7)
-    sd = np.sqrt(best.covariances("fix_error")[:, 0, 0])
+    sd = np.sqrt(best.covariances()["fix_error"][:, 0, 0])
     assert sd[~late].max() < 0.01 < 0.05 < sd[late].min()  # it begins at its mean
 
 
@@ -99,7 +99,7 @@ def test_the_filter_opens_where_the_smoother_does(changing):
     dive, best = changing
     end = replay(dive.problem, dive.initial).known
     own = FilterEngine(dive.initial).layout.columns["fix_error"]
-    sd = np.sqrt(np.diag(best.covariances("fix_error")[-1]))
+    sd = np.sqrt(np.diag(best.covariances()["fix_error"][-1]))
     np.testing.assert_allclose(np.sqrt(np.diag(end.P[own, own])), sd, rtol=0.05)
     there = best.state.calibration["fix_error"][-1]
     assert (np.abs(end.c[LAYOUT["fix_error"]] - there) < 0.5 * sd).all()

@@ -75,11 +75,11 @@ def test_the_smoothers_covariance_has_what_the_optimum_would_move_by(case):
     ]
     K = np.stack(moved, axis=2)
     for variable, part in ((POSE, slice(0, 6)), (VELOCITY, slice(6, 9))):
-        expected = exact.covariances(variable) + K[:, part] @ transpose(K[:, part])
-        found, sd = best.covariances(variable), np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+        expected = exact.covariances()[variable] + K[:, part] @ transpose(K[:, part])
+        found, sd = best.covariances()[variable], np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
         scale = sd[:, :, None] * sd[:, None, :]
         np.testing.assert_allclose(found / scale, expected / scale, atol=0.02)
-        assert (sd**2 > 1.5 * np.diagonal(exact.covariances(variable), axis1=1, axis2=2)).any()
+        assert (sd**2 > 1.5 * np.diagonal(exact.covariances()[variable], axis1=1, axis2=2)).any()
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_a_tilt_within_its_prior_is_estimated_though_it_has_all_pings_rejected_w
     case, config = tilted(TILTED)
     best = batch(case.log, config).optimum()
     assert best.solution.gates["dvl"].mean() > 0.98 and "dvl_pitch" in best.unknowns.estimated
-    sd = np.sqrt(best.covariances("dvl_pitch")[-1, 0, 0])
+    sd = np.sqrt(best.covariances()["dvl_pitch"][-1, 0, 0])
     assert abs(best.state.calibration["dvl_pitch"][0] - np.deg2rad(TILTED)) < 4.0 * sd
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optimum_module, "_contradicted", lambda best: False)

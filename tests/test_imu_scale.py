@@ -52,7 +52,7 @@ def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows(monkeypatch):
     graph = smooth_graph(smoother.problem, smoother.initial, chain.state)
     assert chain.solution.cost == pytest.approx(graph.solution.cost, rel=1e-6)
     for name in SCALES:
-        np.testing.assert_allclose(chain.covariances(name)[-1], graph.covariances(name)[-1], rtol=1e-3, atol=1e-12)
+        np.testing.assert_allclose(chain.covariances()[name][-1], graph.covariances()[name][-1], rtol=1e-3, atol=1e-12)
 
 
 def test_scales_that_are_known_are_held_and_fit():

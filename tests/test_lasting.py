@@ -10,7 +10,7 @@ from rovgraph.config import beliefs, parse_config
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.optimum import joint_prior_sd
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, newest_calibration
+from rovgraph.estimators.smoother import assemble, newest_calibration
 from rovgraph.gauss_markov import stationary_walk, walked
 from rovgraph.simulate import Truth
 from rovgraph.simulate.files import known
@@ -23,7 +23,7 @@ SLOW = {"dvl_rate": 2.0, "imu_rate": 50.0, "fix_interval": 1.0, "start_error": T
 
 
 def optimum_of(log, config):
-    return BatchSmoother(initialise(log, config), log).optimum()
+    return assemble(log, initialise(log, config)).optimum()
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_sd_of_an_error_stays_where_nothing_measures_it(best):
 def test_prediction_is_the_process_and_its_mean():
     config = falcon(calibration={"current": {"mean": [0.3, -0.2], "sd": 0.1, "time_constant_s": 5.0}})
     case = simulated(config, 32.0, water_track=True, **SLOW)
-    dive = BatchSmoother(initialise(case.log, case.config), case.log)
+    dive = assemble(case.log, initialise(case.log, case.config))
     engine = FilterEngine(dive.initial)
     before, time = engine.start(), dive.problem.time
     own, seconds = engine.layout.columns["current"], time[5] - time[4]
@@ -77,7 +77,7 @@ def test_prediction_is_the_process_and_its_mean():
 def test_the_filter_ends_where_the_smoother_does(case, best):
     end = renewed(case.log, case.config).known
     own = FilterEngine(initialise(case.log, case.config)).layout.columns["fix_error"]
-    there, P = newest_calibration(best.state.calibration)["fix_error"], best.covariances("fix_error")[-1]
+    there, P = newest_calibration(best.state.calibration)["fix_error"], best.covariances()["fix_error"][-1]
     sd = np.sqrt(np.diag(P))
     np.testing.assert_allclose(np.sqrt(np.diag(end.P[own, own])), sd, rtol=0.02)
     assert (np.abs(end.c[LAYOUT["fix_error"]] - there) < 0.1 * sd).all()
@@ -86,9 +86,9 @@ def test_the_filter_ends_where_the_smoother_does(case, best):
 def test_isam2_knows_position_as_well_as_the_smoother_does(case, best):
     """Of the error its newest value belongs to the newest fix, not to the keyframe before: it is compared roughly."""
     solver = incremental(case.log, case.config)
-    there, P = newest_calibration(best.state.calibration)["fix_error"], best.covariances("fix_error")[-1]
+    there, P = newest_calibration(best.state.calibration)["fix_error"], best.covariances()["fix_error"][-1]
     assert (np.abs(solver.latest().calibration["fix_error"].ravel() - there) < np.sqrt(np.diag(P))).all()
-    sd = np.sqrt(np.diag(best.covariances(POSE)[-1])[3:])
+    sd = np.sqrt(np.diag(best.covariances()[POSE][-1])[3:])
     np.testing.assert_allclose(np.sqrt(np.diag(solver.known.P)[3:6]), sd, rtol=0.05)
 
 
@@ -100,7 +100,7 @@ def test_without_noise_an_error_is_found():
     found = optimum_of(case.log, case.config)
     off = found.state.calibration["fix_error"] - true["fix_error"]
     assert np.abs(off[:20]).max() < 0.03
-    assert (np.abs(off) < 3 * np.sqrt(np.diagonal(found.covariances("fix_error"), axis1=1, axis2=2))).all()
+    assert (np.abs(off) < 3 * np.sqrt(np.diagonal(found.covariances()["fix_error"], axis1=1, axis2=2))).all()
 
 
 def test_a_simulated_error_has_the_sd_and_the_time_constant_that_are_believed():

@@ -106,7 +106,7 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
 def test_information_at_the_end_is_that_of_the_smoother(straight):
     _, dive = straight
     last = dive.knowledge([len(dive.problem) - 1])
-    expected = np.concatenate([np.sqrt(np.diag(dive.covariances(n)[-1])) for n in dive.unknowns.estimated])
+    expected = np.concatenate([np.sqrt(np.diag(dive.covariances()[n][-1])) for n in dive.unknowns.estimated])
     np.testing.assert_allclose(np.sqrt(np.diag(last.calibration[0])), expected, rtol=1e-8)
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, falcon, initial_conditions, interrupted, renewed, simulated, true_at
 
-from rovgraph.dive import assemble
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.problem import Problem
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.smoother import assemble
 from rovgraph.geometry import Array
 from rovgraph.kernels.error_coordinates import ErrorLayout
 from rovgraph.kernels.filter_state import FilterState

@@ -17,7 +17,6 @@ from rovgraph.engine.lasting import LASTING, _Baseline, find_lasting, unity
 from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
-from rovgraph.state import POSE
 
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
 ERROR = {"estimate": True, "sd": 1.0, "time_constant_s": 20.0}
@@ -135,7 +134,7 @@ def test_search_costs_three_eliminations_of_a_healthy_dive_and_few_of_others(cor
     monkeypatch.setattr(Chain, "eliminate", lambda *a, **b: (calls.append(1), eliminate(*a, **b))[1])
     for (case, config), errors, most in ((with_fixes(seed=2), 0, 3), (correlated, 1, 120)):
         best = batch(case.log, config).optimum()
-        best.covariances(POSE)
+        best.covariances()
         calls.clear()
         assert len(find_lasting(best)[0]) == errors
         assert 0 < len(calls) <= most

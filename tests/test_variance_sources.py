@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 import rovgraph as rg
-from rovgraph.dive import assemble
 from rovgraph.engine.released import release
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import assemble
 from rovgraph.pages.causes import CAUSES, largest_cause
 from rovgraph.pages.reporting import page_of
 from rovgraph.sensors import SENSORS
@@ -34,7 +34,7 @@ def test_the_parts_add_up_to_the_variance_anywhere_in_the_dive(share):
     best = assemble(dive.log, initialise(dive.log, dive.config)).optimum(None)
     k = int(share * (len(best.problem) - 1))
     R = best.state.R_nb[k]
-    P = R @ best.covariances(POSE)[k][3:6, 3:6] @ R.T
+    P = R @ best.covariances()[POSE][k][3:6, 3:6] @ R.T
     assert sum(variance_sources(best, k).values()) == pytest.approx(P[0, 0] + P[1, 1], rel=1e-5)
 
 

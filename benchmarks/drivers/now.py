@@ -12,10 +12,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from online import falcon, replay
 
 from rovgraph.config import Config, load_config
-from rovgraph.dive import assemble, smooth
+from rovgraph.dive import smooth
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.error_state import replay as replay_filter
 from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import assemble
 from rovgraph.log import Log, read_log
 from rovgraph.process import be_frugal
 from rovgraph.simulate import Choices, choices, simulated

@@ -27,7 +27,7 @@ from rovgraph.state import State
 SHORT = 6000  # keyframes whose conditionals take 40 MB
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class ChainOptimum:
     """A chain and where its robust cost is least.
 
@@ -38,11 +38,13 @@ class ChainOptimum:
     ----------
     chain, solution : the dive, and its optimum
     begun : where the last step to it began, of the elimination that all covariances come of; None = there was none
+    at_hand : what it is eliminated to, if it has been
     """
 
     chain: Chain
     solution: Solution[State]
     begun: State | None = None
+    at_hand: SquareRoot | None = None
 
     @property
     def problem(self) -> Problem:
@@ -89,54 +91,35 @@ class ChainOptimum:
         """Where all factors are linearised."""
         return self.state if self.begun is None else self.begun
 
-    @cached_property
-    def root(self) -> SquareRoot:
-        """All factors linearised and eliminated, what is considered last in the border; errors count from `state`."""
-        root = self.wide.eliminate(self.linearised_at, self.solution.gates)
-        if self.begun is not None:
-            root.move_to(root.solve(len(self._believed))[1])
+    def eliminated(self) -> SquareRoot:
+        """All factors linearised and eliminated, what is considered last in the border; errors count from `state`.
+
+        Of a long dive there is no room for two: what was at hand is given away.
+        """
+        root = self.at_hand
+        if root is None:
+            root = self.wide.eliminate(self.linearised_at, self.solution.gates)
+            if self.begun is not None:
+                root.move_to(root.solve(len(self._believed))[1])
+        self.at_hand = root
+        _ = self._end, self.linear  # they need little of it
+        if len(self.problem) > SHORT:
+            self.at_hand = None
         return root
 
     @cached_property
     def _end(self) -> SquareRoot:
         """The same, of the newest keyframe and the border."""
-        if self._at_hand:
-            return replace(self.root, conditionals=self.root.conditionals[-1:].copy())
-        return self.wide.eliminate(self.linearised_at, self.solution.gates, kept=1)
-
-    @property
-    def _short(self) -> bool:
-        """Whether all conditionals may stay in memory."""
-        return len(self.problem) <= SHORT
-
-    @property
-    def _at_hand(self) -> bool:
-        """Whether `root` is there, or may be."""
-        return self._short or "root" in vars(self)
-
-    def without_what_is_at_hand(self) -> "ChainOptimum":
-        """The same; of a long dive, what it keeps is large and can be made again."""
-        return self if self._short else ChainOptimum(replace(self.chain), self.solution, self.begun)
-
-    @cached_property
-    def _marginals(self) -> tuple[Array, Array]:
-        """Covariances of the keyframes and of the border.
-
-        What they come of would be the larger part of a long dive.
-        """
-        root = self.root  # first, as the rest comes of it
-        P_y = self._end.border_covariance(self._believed)
-        if self._short:
-            return root.covariances(P_y), P_y
-        _ = self.linear  # for nothing, while it is at hand
-        del vars(self)["root"]
-        return root.turn_into_covariances(P_y), P_y
+        if self.at_hand is None:
+            return self.wide.eliminate(self.linearised_at, self.solution.gates, kept=1)
+        at_hand = self.at_hand
+        return replace(at_hand, conditionals=at_hand.conditionals[-1:].copy(), border=at_hand.border.copy())
 
     @cached_property
     def linear(self) -> tuple[float, float]:
         """Log determinant of the information of what is estimated, and its least sum of squares."""
         held, gates = len(self._believed), self.solution.gates
-        root = self.root if self._at_hand else self.wide.eliminate(self.linearised_at, gates, diagonal=True)
+        root = self.at_hand or self.wide.eliminate(self.linearised_at, gates, diagonal=True)
         return root.log_determinant(held), root.least(held)
 
     def rested(self) -> "ChainOptimum":
@@ -146,20 +129,13 @@ class ChainOptimum:
         ------
         InputError : the data do not determine some variable, which is named
         """
-        held, known, gates = len(self._believed), self.solution, self.solution.gates
+        known = self.solution
         if not known.converged:
             return self
-        promised, (x, y) = self.root.explained(held), self.root.solve(held)
-        step = ChainStep(x, y)
-        point = self.wide.moved(self.state, step, 1.0)
-        decrease = self.chain.cost(self.state, gates) - self.chain.cost(point, gates)
-        if promised <= gauss_newton.REST and left_after(promised, decrease) <= gauss_newton.FINE:
-            there = replace(known, point=point, cost=known.cost - decrease, iterations=known.iterations + 1)
-            rested = ChainOptimum(self.chain, there, self.state)
-            self.root.move_to(y)
-            vars(rested).update(wide=self.wide, root=vars(self).pop("root"))
+        promised, decrease, step, rested = self._last_step()
+        if rested is not None:
             return rested
-        del vars(self)["root"]  # of a long dive there is no room for two
+        point = self.wide.moved(self.state, step, 1.0)
         further = self.wide.moved(self.state, step, whole_share(promised, decrease))
         some = [one for one in (at_rest(self.chain, there, known) for there in (further, point)) if one]
         ahead = min(some, key=lambda one: one.cost, default=known)
@@ -167,6 +143,22 @@ class ChainOptimum:
             return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
         again = resume(self.chain, self.state, known)
         return ChainOptimum(self.chain, replace(again, iterations=known.iterations + again.iterations))
+
+    def _last_step(self) -> "tuple[float, float, ChainStep, ChainOptimum | None]":
+        """What the step from here promises and yields, the step, and the optimum there if it is at rest."""
+        root, held, known = self.eliminated(), len(self._believed), self.solution
+        promised, (x, y) = root.explained(held), root.solve(held)
+        step = ChainStep(x, y)
+        point = self.wide.moved(self.state, step, 1.0)
+        decrease = self.chain.cost(self.state, known.gates) - self.chain.cost(point, known.gates)
+        if promised > gauss_newton.REST or left_after(promised, decrease) > gauss_newton.FINE:
+            return promised, decrease, step, None
+        there = replace(known, point=point, cost=known.cost - decrease, iterations=known.iterations + 1)
+        root.move_to(y)
+        self.at_hand = None  # errors count from there now
+        rested = ChainOptimum(self.chain, there, self.state, root)
+        rested.wide = self.wide
+        return promised, decrease, step, rested
 
     def _other(self, chain: Chain, moved: Mapping[str, Array], score: Array | None = None) -> "ChainOptimum":
         """The optimum of a chain with other unknowns of these, from where its linear problem has it.
@@ -176,16 +168,18 @@ class ChainOptimum:
         moved : constants that are held now, and by how much they move for it
         score : ndarray, shape (c,), as `SquareRoot.border_with`
         """
-        places, y = self.wide.layout.places, np.zeros(len(self.root.border))
-        for name, by in moved.items():
-            y[places[name][1]] = by
-        free = [places[name] for name in chain.unknowns.estimated]
-        free_border = np.concatenate([NOTHING, *(np.r_[part] for border, part in free if border)])
-        y = self.root.border_with(free_border, y, score)
-        begin = self.wide.moved(self.state, ChainStep(self.root.followed(y), y), 1.0)
-        del vars(self)["root"]
+        begin = self._moved_to(chain.unknowns.estimated, moved, score)
         known = at_rest(chain, begin, self.solution) or resume(chain, begin, self.solution, gauss_newton.REST)
         return ChainOptimum(chain, known).rested()
+
+    def _moved_to(self, estimated: Sequence[str], moved: Mapping[str, Array], score: Array | None) -> State:
+        """Where the linear problem has its least sum with these estimated, and the rest as in `_other`."""
+        root, places, y = self.eliminated(), self.wide.layout.places, np.zeros(self.wide.layout.c)
+        for name, by in moved.items():
+            y[places[name][1]] = by
+        free = [places[name] for name in estimated]
+        y = root.border_with(np.concatenate([NOTHING, *(np.r_[part] for border, part in free if border)]), y, score)
+        return self.wide.moved(self.state, ChainStep(root.followed(y), y), 1.0)
 
     def sd_of_noise(self) -> dict[str, Array]:
         """The sd of what is estimated and constant, were what is considered known: name -> ndarray, shape (dim,)."""
@@ -195,7 +189,7 @@ class ChainOptimum:
 
     def moved_by_considered(self) -> Iterator[State]:
         """The optimum with each component of what is considered one sd away, and all that is estimated along."""
-        root, held = self.root, len(self._believed)
+        root, held = self.eliminated(), len(self._believed)
         for k in range(held):
             y = np.zeros(len(root.border))
             y[len(y) - held + k] = np.sqrt(self._believed[k, k])
@@ -216,21 +210,14 @@ class ChainOptimum:
         """As `rovgraph.engine.optimum.Optimum`."""
         return self._other(replace(self.chain, unknowns=self.unknowns.estimating(names)), {})
 
-    def covariances(self, variable: str) -> Array:
+    def covariances(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        if variable in COLUMNS:
-            return np.asarray(self._marginals[0][:, COLUMNS[variable], COLUMNS[variable]])
-        border, part = self.wide.layout.places[variable]
-        if not border:
-            return self._marginals[0][:, part, part]
-        P = self._marginals[1][part, part]
-        return np.broadcast_to(P, (len(self.problem), *P.shape))
-
-    def forget_covariances(self) -> None:
-        """As `rovgraph.engine.optimum.Optimum`."""
-        vars(self).pop("_marginals", None)
-        if not self._short:
-            vars(self).pop("root", None)
+        root, P_y = self.eliminated(), self._end.border_covariance(self._believed)
+        P = root.covariances(P_y) if len(self.problem) <= SHORT else root.turn_into_covariances(P_y)
+        out = {name: P[:, own, own] for name, own in COLUMNS.items()}
+        for name, (border, own) in self.wide.layout.places.items():
+            out[name] = np.broadcast_to(P_y[own, own], (len(P), *P_y[own, own].shape)) if border else P[:, own, own]
+        return out
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -254,7 +241,7 @@ class ChainOptimum:
         held = replace(self.chain, unknowns=self.unknowns.of(()))
         white = np.random.default_rng(seed).standard_normal((len(self.problem), MOTION))
         # the border does not touch what the keyframes' own columns are eliminated to
-        own = held.eliminate(self.linearised_at, self.solution.gates) if self.wide.layout.walking else self.root
+        own = held.eliminate(self.linearised_at, self.solution.gates) if self.wide.layout.walking else self.eliminated()
         noise = own.draw(white)
         more, less = (
             self._knowledge_at(held.moved(self.linearised_at, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
@@ -271,7 +258,7 @@ class ChainOptimum:
 
     def with_score(self, name: str, score: Array) -> "ChainOptimum":
         """The optimum with another `Belief.score` of an estimated constant."""
-        more, own = np.zeros(len(self.root.border)), replace(self.beliefs[name], score=score)
+        more, own = np.zeros(self.wide.layout.c), replace(self.beliefs[name], score=score)
         more[self.wide.layout.places[name][1]] = score - self.beliefs[name].score
         return self._other(replace(self.chain, beliefs={**self.beliefs, name: own}), {}, more)
 

@@ -71,15 +71,11 @@ class Optimum(Protocol):
     @property
     def places(self) -> Mapping[int, Array]: ...
 
-    def covariances(self, variable: str) -> Array:
-        """Marginal covariances of a state or calibration variable at every keyframe, shape (n, d, d).
+    def covariances(self) -> Mapping[str, Array]:
+        """Marginal covariances at every keyframe, by state or calibration variable, shape (n, d, d).
 
-        What is considered has that of its prior.
+        What is considered has that of its prior. They are large, and calculated each time.
         """
-        ...
-
-    def forget_covariances(self) -> None:
-        """Free the memory of `covariances`; they are calculated again where they are asked for again."""
         ...
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:

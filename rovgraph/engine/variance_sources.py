@@ -23,6 +23,7 @@ from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.pieces import pieces
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain_posterior
+from rovgraph.process import stage
 from rovgraph.state import State
 
 POSITION = slice(3, 6)  # in a keyframe's block
@@ -30,6 +31,7 @@ STEP = 1e-2  # of a standard deviation, of central differences
 PRIOR = {"attitude": slice(0, 3), "position": POSITION, "velocity": slice(6, 9), "bias": slice(9, 15)}
 
 
+@stage
 def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
     """Variance of a keyframe's north plus that of its east, by source, the largest first [m^2].
 
@@ -37,15 +39,12 @@ def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
     ``start velocity`` and ``start bias`` for the priors of the first keyframe, and calibration variables for their
     priors and walks. Their sum is the variance of the estimate, at the IMU.
     """
-    names, wide, root, point = best.unknowns.considered, best.wide, best.root, best.linearised_at
+    names, wide, point = best.unknowns.considered, best.wide, best.linearised_at
     held = sum(TABLE[name].dim for name in names)
     u = np.zeros((wide.layout.d, 2))
     u[POSITION] = point.R_nb[keyframe].T[:, :2]
     found: dict[str, float] = {}
-    x, y = _covariance_with(root, keyframe, u, held)
-    effect = u.T @ _by_held(root, keyframe, held)
-    del root
-    best.forget_covariances()  # with what they come of
+    x, y, effect = _moves(best.eliminated(), keyframe, u, held)
     for own_x, own_y in zip(np.moveaxis(x, 2, 0), y.T, strict=True):
         step = ChainStep(np.ascontiguousarray(own_x), own_y)
         for source, variance in [*_of_noise(wide, point, step), *_of_measurements(wide, best, step)]:
@@ -57,6 +56,11 @@ def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
         for name, part in zip(names, np.split(brought, ends[:-1]), strict=True):
             found[name] = found.get(name, 0.0) + float(part.sum())
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _moves(root: SquareRoot, keyframe: int, u: Array, held: int) -> tuple[Array, Array, Array]:
+    """As `_covariance_with`, and what u' x of the keyframe is by what is held, shape (m, held)."""
+    return *_covariance_with(root, keyframe, u, held), u.T @ _by_held(root, keyframe, held)
 
 
 def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tuple[Array, Array]:

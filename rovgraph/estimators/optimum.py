@@ -76,7 +76,8 @@ def _with_what_is_shown(free: ChainOptimum, considered: Sequence[str], hidden: C
 
     Where what is left contradicts the dive again, all but what noise moves is.
     """
-    sd = {name: np.sqrt(np.diag(free.covariances(name)[-1])) for name in considered}
+    P = free.covariances()
+    sd = {name: np.sqrt(np.diag(P[name][-1])) for name in considered}
     moved = [name for name in considered if name in hidden or (name == ARM and noise_moves_arm(free, sd[ARM]))]
     rest = [
         name

@@ -1,7 +1,7 @@
 """Batch smoothing of a whole dive."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.stretches import Searches
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
@@ -25,6 +26,7 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.process import stage
 from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
@@ -32,7 +34,7 @@ PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
 CENTRED_REACH_S = 0.1  # around the time_offset that was found
 
 
-@dataclass
+@dataclass(frozen=True)
 class BatchSmoother:
     """A dive that is solved at once.
 
@@ -40,35 +42,29 @@ class BatchSmoother:
     ----------
     initial : of `rovgraph.estimators.initialise.initialise`
     log : the dive
-    time_offsets : how late stamps are; None = as the configuration believes
-    searches : for stretches of wrong measurements, shared with whoever solves the same dive
-    problem : the dive as arrays
+    problem : the same as arrays
     left_out : (sensor, reason) -> count of measurements that never reach it
+    time_offsets : how late stamps are
+    searches : for stretches of wrong measurements, shared with whoever solves the same dive
     """
 
     initial: InitialConditions
     log: Log
-    time_offsets: TimeOffsets = None  # type: ignore[assignment]
-    searches: Searches = field(default_factory=Searches)
+    problem: Problem
+    left_out: Mapping[tuple[str, str], int]
+    time_offsets: TimeOffsets
+    searches: Searches
 
-    def __post_init__(self) -> None:
-        assembly = assembly_of(self.initial, self.time_offsets)
-        assembly.take(self.log)
-        assembly.extend(finish=True)
-        self.time_offsets = assembly.time_offsets
-        self.problem, self.left_out = assembly.problem, assembly.left_out
-
-    def forget_motion_covariances(self) -> None:
-        """Free the memory of what a filter needs, and GTSAM's graph of a dive that sees places, but not the chain."""
-        if PLACE not in self.problem.used:
-            self.problem = self.problem.without_covariances()
+    def without_covariances(self) -> "BatchSmoother":
+        """The same without what the chain does not need; GTSAM's graph of a dive that sees places does."""
+        return self if PLACE in self.problem.used else replace(self, problem=self.problem.without_covariances())
 
     def solve(self, states: State | None = None) -> Estimate:
         """The smoothed trajectory with its uncertainty; ``states`` as `optimum` takes them."""
         return smoothed(self.optimum(states), self.initial)
 
     def optimum(self, states: State | None = None) -> Optimum:
-        """The dive and its optimum.
+        """The dive's optimum.
 
         Parameters
         ----------
@@ -97,7 +93,7 @@ class BatchSmoother:
         """
         if self.time_offsets.off(calibration) < PLACED_WITHIN_S:
             return None
-        return BatchSmoother(self.initial, self.log, self.time_offsets.centred(calibration, CENTRED_REACH_S))
+        return assemble(self.log, self.initial, self.time_offsets.centred(calibration, CENTRED_REACH_S))
 
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""
@@ -108,17 +104,34 @@ class BatchSmoother:
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())
 
 
+@stage
+def assemble(
+    log: Log,
+    initial: InitialConditions,
+    time_offsets: TimeOffsets | None = None,
+    searches: Searches | None = None,
+) -> BatchSmoother:
+    """All keyframes of a log and what lies between them; ``time_offsets`` None = as the configuration believes."""
+    assembly = assembly_of(initial, time_offsets)
+    assembly.take(log)
+    assembly.extend(finish=True)
+    known = assembly.left_out, assembly.time_offsets, searches or Searches()
+    return BatchSmoother(initial, log, assembly.problem, *known)
+
+
 def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
     """The last of values of shape (n, dim) or (dim,), shape (dim,)."""
     return {name: value.reshape(-1, value.shape[-1])[-1] for name, value in calibration.items()}
 
 
+@stage
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
     best, relative = without_what_noise_moves(best)
     states, problem = best.state, best.problem
-    trajectory = body_trajectory(problem.keyframes, states, b, best.covariances(POSE), best.covariances(VELOCITY))
-    bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
+    covariances = best.covariances()
+    trajectory = body_trajectory(problem.keyframes, states, b, covariances[POSE], covariances[VELOCITY])
+    bias_sd = np.sqrt(np.diagonal(covariances[BIAS], axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}
     held = [name for name in best.unknowns.considered if best.beliefs[name].estimate]
@@ -126,17 +139,16 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(segment)) + 1
     for name, walk in best.unknowns.walks.items():
         rows = np.concatenate([[0], begun, [n - 1]]) if walk else ends
-        P = best.covariances(name)
+        P = covariances[name]
         value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
         history[name] = calibration_history(
             name, trajectory.time[rows], value, np.sqrt(np.diagonal(P[rows], axis1=1, axis2=2))
         )
         final[name], spread[name] = value[-1], P[-1]
     for name in held:
-        spread[name] = best.covariances(name)[-1]
+        spread[name] = covariances[name][-1]
         both = np.tile(final[name], (2, 1)), np.tile(np.sqrt(np.diag(spread[name])), (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
-    best.forget_covariances()  # of a long dive they are large
     return Estimate(
         "smoothed",
         trajectory,

@@ -19,7 +19,7 @@ from rovgraph.graph.batch import DiveGraph, make_graph, solve
 from rovgraph.graph.information import knowledge, noise_of_states, sensitivity
 from rovgraph.graph.keys import calibration_key, key
 from rovgraph.graph.marginals import covariances, marginals, newest_covariance, newest_keys
-from rovgraph.state import PLACE, PLACE_DIM, State
+from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,6 @@ class GraphOptimum:
         return {number: self.solution.point.atVector(key(PLACE, number)) for number in numbers}
 
     @cached_property
-    def _covariances(self) -> dict[int, Array]:
-        return covariances(marginals(self.graph, self.solution.point, self.solution.gates))
-
-    @cached_property
     def _wide(self) -> tuple[DiveGraph, gtsam.Values]:
         """The graph in which what is considered is estimated, and where it is linearised."""
         names = self.unknowns.considered
@@ -72,22 +68,22 @@ class GraphOptimum:
         sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])
         return {one: K * sd for one, K in moves.items()}
 
-    def covariances(self, variable: str) -> Array:
+    def covariances(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        if variable in self.unknowns.considered:
+        known = covariances(marginals(self.graph, self.solution.point, self.solution.gates))
+        out = {}
+        for variable in (POSE, VELOCITY, BIAS, *self.unknowns.estimated):
+            keys = self._keys(variable)
+            P = np.array([known[own] for own in keys])
+            if self.unknowns.considered:
+                K = np.array([self._sensitivity[own] for own in keys])
+                P += K @ transpose(K)
+            out[variable] = P
+        for variable in self.unknowns.considered:
             belief = self.beliefs[variable]
-            return np.broadcast_to(
-                np.eye(belief.variable.dim) * belief.sd**2, (self.graph.count, *[belief.variable.dim] * 2)
-            )
-        known = np.array([self._covariances[own] for own in self._keys(variable)])
-        if not self.unknowns.considered:
-            return known
-        K = np.array([self._sensitivity[own] for own in self._keys(variable)])
-        return np.asarray(known + K @ transpose(K))
-
-    def forget_covariances(self) -> None:
-        """As `rovgraph.engine.optimum.Optimum`."""
-        vars(self).pop("_covariances", None)
+            own = np.eye(belief.variable.dim) * belief.sd**2
+            out[variable] = np.broadcast_to(own, (self.graph.count, *own.shape))
+        return out
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -16,13 +16,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rovgraph.config import Config
-from rovgraph.dive import assemble
 from rovgraph.engine.stretches import Searches
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import BatchSmoother, assemble
 from rovgraph.estimators.thesis import Filter, FilterJob, run_filters
 from rovgraph.log import Log
 
@@ -256,7 +255,7 @@ def with_hydrodynamics(config: Config) -> Config:
 
 def assembled(task: Task) -> BatchSmoother:
     """Keyframes of a log and what lies between them."""
-    return assemble(task.log, initialise(task.log, task.config), task.searches)
+    return assemble(task.log, initialise(task.log, task.config), searches=task.searches)
 
 
 def stepped(batch: BatchSmoother) -> ErrorStateFilter:

@@ -12,7 +12,6 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Variable
 from rovgraph.config import Config
-from rovgraph.dive import assemble
 from rovgraph.engine.optimum import OTHERS, Optimum, joint_prior_sd
 from rovgraph.errors import InputError
 from rovgraph.estimators.initialise import initialise
@@ -22,6 +21,7 @@ from rovgraph.estimators.observability import (
     verdict,
     without_spurious_information,
 )
+from rovgraph.estimators.smoother import assemble
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.frozen import without_frozen

@@ -19,7 +19,7 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
-from rovgraph.process import give_back
+from rovgraph.process import stage
 from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 # of some keyframes, their number first in every shape: state, calibration, covariances of pose and velocity, sd of the
@@ -90,9 +90,13 @@ class FilterHistory:
 
     def estimate(self, problem: Problem, kind: str) -> Estimate:
         """The filtered estimate of every keyframe."""
-        self._pieces = [_joined(self._pieces)]  # of a long dive they are not kept twice
-        give_back()
+        self._join()
         return self._estimate(problem, kind, self._pieces[0], None)
+
+    @stage
+    def _join(self) -> None:
+        """Keep what was found in one piece; of a long dive it is not kept twice."""
+        self._pieces = [_joined(self._pieces)]
 
     def smoothed(self, problem: Problem, kind: str, known: Sequence[Gaussian]) -> Estimate:
         """The estimate of every keyframe that a smoother has found."""
