@@ -137,7 +137,8 @@ class Runs:
     def show_noise(self, long: NDArray[np.bool_]) -> bool:
         """Whether the values of all but the long ones, shape (m,), show noise."""
         others = ~np.isin(self.count, self.count[long])
-        return np.count_nonzero(others) >= ENOUGH_VALUES and shows_noise(self.values[others, 0], self.count[others])
+        enough = int(np.count_nonzero(others)) >= ENOUGH_VALUES
+        return enough and shows_noise(self.values[others, 0], self.count[others])
 
 
 @dataclass(frozen=True)
@@ -396,7 +397,7 @@ def _mean(
 def _noise_shows(values: Array) -> bool:
     """Whether any component of (n, k) shows noise wherever it changes."""
     changes = (column[np.append(True, np.diff(column) != 0.0)] for column in values.T)
-    return any(shows_noise(column, np.ones(len(column))) for column in changes)
+    return any(shows_noise(column, np.ones(len(column), np.int64)) for column in changes)
 
 
 def _halves(pings: Stream, company: Company) -> Iterator[FrozenStretch]:
@@ -489,8 +490,9 @@ def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | Non
     turning : rate of turn that the gyro shows at rest [rad/s]; None = the median of the log
     """
     long = runs.are_long(HOLDS[sensor])
-    shown = _motion_shown(sensor, runs, long, log, config, turning) if long.any() else None
-    for k in np.flatnonzero(long).tolist() if shown is not None else ():
+    if (shown := _motion_shown(sensor, runs, long, log, config, turning) if long.any() else None) is None:
+        return
+    for k in np.flatnonzero(long).tolist():
         if why := shown(Run(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
             yield k, why
 
@@ -576,7 +578,7 @@ def _dive_by_dvl(pings: Stream, imu: Stream, config: Config, runs: Runs) -> Show
     return shown
 
 
-def shows_noise(values: Array, counts: Array) -> bool:
+def shows_noise(values: Array, counts: NDArray[np.int64]) -> bool:
     """Whether n values, each measured ``counts`` times in a row, hardly ever repeat, and not for their resolution only.
 
     A coarse depth does not repeat in a dive either, but its second differences are within a few of its steps.
