@@ -454,7 +454,7 @@ def test_a_step_is_a_correction_a_prediction_and_a_correction(estimator):
     dive = estimator.problem
     k = next(k for k in range(40, len(dive)) if dive.measured_in(k)[0] < dive.first[k] < dive.measured_in(k)[1])
     before = estimator.filtered[k - 1]
-    step = engine.step(dive, k, before, {})
+    step = engine.step(dive, k, before, {}, wholly=True)
     departed = engine.correct(before, dive, between(dive, k), {})
     transition = engine.predict(dive, k, departed)
     filtered = engine.correct(transition.predicted, dive, here(dive, k), {})

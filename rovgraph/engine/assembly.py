@@ -228,34 +228,37 @@ class Assembly:
         begin, dive = len(self), self._dive
         start = float(dive.keyframes[begin - 1, at.TIME] if begin else table[0, 0])
         most = begin + len(self._closing()) + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
-        self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
+        if most > len(dive.keyframes):
+            self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
         late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
-        at.place_keyframes(self._streams, late, self._rule, self._dive, count, one, finish)
+        streams = self._streams
+        at.place_keyframes(streams, late, self._rule, self._dive, count, one, finish)
         made = len(self) - begin
         if made:
-            self._assemble(begin)
+            self._assemble(begin, streams)
         self._due = self._next_due()
         return made
 
-    def _assemble(self, begin: int) -> None:
+    def _assemble(self, begin: int, streams: at.Streams) -> None:
         """Fill what lies between the keyframes from ``begin`` on."""
-        dive, streams, n = self._dive, self._streams, len(self)
+        dive, n = self._dive, len(self)
         pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._events[:0]
         first = int(dive.keyframes[begin - 1, at.UPTO]) if begin else 0
         own = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
         late = int(np.count_nonzero(self._sensors[own, at.LAG] >= 0)) if len(self._sensors) else 0
         rows, windows = int(dive.counts[at.ROWS]), int(dive.counts[at.WINDOWS])
         more, scaled = rows + len(own) + len(pieces), int(self._rule.scaled)
-        self._dive = dive._replace(
-            motions=_grown(dive.motions, begin, n),
-            weights=_grown(dive.weights, begin, n),
-            scales=_grown(dive.scales, begin * scaled, n * scaled),
-            rows=_grown(dive.rows, rows, more),
-            row_scales=_grown(dive.row_scales, rows * scaled, more * scaled),
-            of=_grown(dive.of, rows, more, axis=1),
-            windows=_grown(dive.windows, windows, windows + late + 1),
-            names=_grown(dive.names, rows, more),
-        )
+        if n > len(dive.motions) or more > len(dive.rows) or windows + late >= len(dive.windows):
+            self._dive = dive._replace(
+                motions=_grown(dive.motions, begin, n),
+                weights=_grown(dive.weights, begin, n),
+                scales=_grown(dive.scales, begin * scaled, n * scaled),
+                rows=_grown(dive.rows, rows, more),
+                row_scales=_grown(dive.row_scales, rows * scaled, more * scaled),
+                of=_grown(dive.of, rows, more, axis=1),
+                windows=_grown(dive.windows, windows, windows + late + 1),
+                names=_grown(dive.names, rows, more),
+            )
         at.assemble(streams, pieces, self._rule, self._integration, self._dive, begin)
 
     def truncate(self, n: int) -> None:

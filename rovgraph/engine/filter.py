@@ -120,7 +120,7 @@ class FilterEngine:
         B, L = np.zeros((layout.size, layout.width - layout.size)), np.diag(sd[layout.size :])
         return Gaussian(state_vector(prior.state), calibration_vector(self.unknowns.fixed), P, (), B, L)
 
-    def step(self, problem: Problem, k: int, before: Gaussian, gates: Gates) -> FilterStep:
+    def step(self, problem: Problem, k: int, before: Gaussian, gates: Gates, wholly: bool = False) -> FilterStep:
         """Take the interval that ends with keyframe k.
 
         Parameters
@@ -128,11 +128,12 @@ class FilterEngine:
         problem : the dive
         before : the keyframe before, or at the first `start`
         gates : renewed in place
+        wholly : tell the way to the keyframe, too
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
         here, met = self._first_here(problem, k), Met.of(problem, k, len(before.c))
         if self._knows_all(problem, k, before):
-            return self._step(problem, k, before, gates, here, met)
+            return self._step(problem, k, before, gates, here, met, wholly)
         departed = transition = None
         predicted = before
         if k > 0:
@@ -141,7 +142,7 @@ class FilterEngine:
             transition = self.predict(problem, k, self._changed(departed, problem, k))
             predicted = transition.predicted
         filtered = self.correct(predicted, problem, slice(here, met.end), gates, met)
-        return FilterStep(departed, transition, filtered, met)
+        return FilterStep(filtered, met, departed, transition)
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
         """Whether kernels know all of the interval that ends with keyframe k."""
@@ -149,16 +150,19 @@ class FilterEngine:
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
 
-    def _step(self, problem: Problem, k: int, before: Gaussian, gates: Gates, here: int, met: Met) -> FilterStep:
+    def _step(
+        self, problem: Problem, k: int, before: Gaussian, gates: Gates, here: int, met: Met, wholly: bool
+    ) -> FilterStep:
         """`step` by one call of a kernel."""
-        between, departed, predicted = here - met.begin, _room(before), _room(before)
+        between, departed = here - met.begin, _room(before) if wholly else _NO_STATE
+        predicted = _room(before) if wholly else _NO_STATE._replace(x=np.empty(21), c=np.empty(len(before.c)))
         own = self._interval(problem, slice(met.begin, met.end), k, between)
         known, out = self._take_interval(before, own, gates, departed, predicted)
         for some, of in ((slice(0, between), before), (slice(between, None), predicted)):
             met.x[some], met.c[some] = of.x, of.c
         met.nis[:], met.weight[:] = out.nis, out.weight
-        transition = Transition(out.F, out.Q, _estimate(predicted))
-        return FilterStep(_estimate(departed), transition, _estimate(known), met)
+        way = (_estimate(departed), Transition(out.F, out.Q, _estimate(predicted))) if wholly else (None, None)
+        return FilterStep(_estimate(known), met, *way)
 
     def _interval(self, problem: Problem, some: slice | Index, k: int = 0, between: int = 0) -> Interval:
         """Measurements, the first ones before the motion to keyframe k, if there is one, as kernels take them."""

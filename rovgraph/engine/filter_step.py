@@ -174,16 +174,16 @@ class FilterStep:
 
     Attributes
     ----------
-    departed : the keyframe before, with what was measured after it; None at the first keyframe
-    transition : the way from there; None at the first keyframe
     filtered : the keyframe that ends the interval
     met : the measurements
+    departed : the keyframe before, with what was measured after it; None at the first keyframe, or not asked for
+    transition : the way from there; None in the same cases
     """
 
-    departed: Gaussian | None
-    transition: Transition | None
     filtered: Gaussian
     met: Met
+    departed: Gaussian | None
+    transition: Transition | None
 
 
 @dataclass(frozen=True)

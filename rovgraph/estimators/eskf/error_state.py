@@ -99,8 +99,9 @@ class ErrorStateFilter:
 
     def step(self) -> FilterStep:
         """Take the next interval: correct, predict, correct; now and then go on from the smoothed dive so far."""
-        done = self.engine.step(self.problem, len(self.history), self.known, self.gates)
-        if done.departed is not None and done.transition is not None and not self.reinitialise_at:
+        smooths = not self.reinitialise_at
+        done = self.engine.step(self.problem, len(self.history), self.known, self.gates, smooths)
+        if smooths and done.departed is not None and done.transition is not None:
             self.departed.append(done.departed)
             self.transitions.append(done.transition)
         self.known = done.filtered
