@@ -79,6 +79,10 @@ class _WidenedChain(Chain):
     timed: Mapping[str, Measurements]
 
     @cached_property
+    def _unknown_to_kernels(self) -> set[str]:
+        return super()._unknown_to_kernels | self.timed.keys()
+
+    @cached_property
     def given(self) -> dict[str, Measurements]:
         given = self._unknown_to_kernels
         if given <= self.timed.keys():  # in the order in which they measure first, as of all blocks
