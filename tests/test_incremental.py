@@ -8,6 +8,7 @@ from dives import (
     attitude_errors,
     batch,
     changed,
+    exact,
     falcon,
     fed,
     incremental,
@@ -190,9 +191,9 @@ def apart(one, other) -> Array:
 
 
 def test_what_isam2_smooths_at_its_end_is_the_chains_optimum(case, whole):
-    chain = batch(case.log, case.config).solve()
-    assert apart(whole.solve(), chain).max() < 0.05
-    np.testing.assert_allclose(whole.solve().trajectory.p_sd, chain.trajectory.p_sd, rtol=0.02)
+    chain = batch(case.log, exact(case.config)).solve()
+    assert apart(whole.solve(), chain).max() < 0.01
+    np.testing.assert_allclose(whole.solve().trajectory.p_sd, chain.trajectory.p_sd, rtol=1e-3)
 
 
 def test_what_isam2_knows_of_its_newest_keyframe_is_what_the_dive_so_far_shows(case, whole):
