@@ -118,9 +118,9 @@ def smooth(
     solver = _Solver(log, initialise(log, config), frozen, gaps, findings, estimate, progress)
     solver.solve()
     for search in (find_noise, find_errors) if config.graph.find_noise else ():
-        if solver.is_taught_by(search):
+        if solver.learns_by(search):
             solver.solve()
-    return solver.told()
+    return solver.result()
 
 
 @dataclass
@@ -199,7 +199,7 @@ class _Solver:
             self.before = self.before or self.estimates[0].trajectory
         return bool(found)
 
-    def told(self) -> Dive:
+    def result(self) -> Dive:
         """The dive, with what brings its variance, and what was found in it."""
         more: dict[str, object] = {}
         if isinstance(self.best, ChainOptimum):
