@@ -187,7 +187,7 @@ class _Solver:
             self.estimates = [_covering(estimate, self.rivals, best) for estimate in self.estimates]
         self.estimates.append(batch.dead_reckoning())
 
-    def is_taught_by(self, search: Search) -> bool:
+    def learns_by(self, search: Search) -> bool:
         """Whether a search finds in the optimum what was not believed; it is believed from now on."""
         if not isinstance(self.best, ChainOptimum):
             return False
