@@ -172,7 +172,9 @@ class Clocks:
         """Whether the stamps of a sensor stand still while its messages come."""
         assert message.stamp is not None
         sensor = message.readings[0].sensor if message.readings else ""
-        moves = self._moves.setdefault((message.source, message.clock, sensor), _Moves(message.arrival, message.stamp))
+        own = message.source, message.clock, sensor
+        if (moves := self._moves.get(own)) is None:
+            moves = self._moves[own] = _Moves(message.arrival, message.stamp)
         if abs(message.stamp - moves.stamp) > STILL_RANGE_S:
             moves.arrival, moves.stamp, moves.count = message.arrival, message.stamp, 0
             if moves.still:
