@@ -41,11 +41,13 @@ from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
 from rovgraph.sensors import SENSORS, ModelAiding
-from rovgraph.sensors.sensor import none_refused, of_instrument
+from rovgraph.sensors.sensor import of_instrument
 from rovgraph.state import PLACE
 
 KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
 BUFFER = 64  # rows of an array to begin with
+Place = tuple[float, int, int, float]  # time, precedence and number of the sensor, name of what is seen
+NEVER: Place = (-math.inf, 0, 0, 0.0)
 _FATES = {
     at.EARLY: "before the first IMU sample",
     at.LATE: "after the last IMU sample",
@@ -105,7 +107,10 @@ class Assembly:
         self._R_sb = mount_matrix(self.config.imu.mount_rpy_deg).T
         self._imu, self._samples = np.empty((BUFFER, 7)), 0
         self._fresh: list[tuple[float, Array]] = []  # samples that have no row yet
-        self._events, self._come = np.empty((BUFFER, at.VALUES + 2 * self._most)), 0
+        self._listed, self._come = np.empty((BUFFER, at.VALUES + 2 * self._most)), 0
+        self._waiting: list[Measurement] = []  # that have no row yet, in their order after all that have
+        self._last = NEVER  # place of the last of all
+        self._rank = {s: (precedence(s), k) for s, k in self._which.items()}
         self._signals: list[Measurement] = []  # of thrusters
         self._reasons: list[str] = []  # why measurements are refused
         self._steps = np.full(at.PERIODS + 1, math.inf)
@@ -154,9 +159,9 @@ class Assembly:
             admissible.append(stream if mask.all() else stream.take(mask))
         if admissible:
             admissible.sort(key=lambda stream: self._which[stream.sensor])
-            self._events = self._wanted(in_precedence(admissible))
-            self._come = len(self._events)
-            self._order = np.empty(self._come, np.int64)
+            self._listed = self._wanted(in_precedence(admissible))
+            self._come = len(self._listed)
+            self._order, self._last = np.empty(self._come, np.int64), self._place_of(self._come - 1)
 
     def insert(self, m: Measurement, settled: float = -math.inf) -> InsertResult:
         """Take a measurement, whenever it comes; keyframes that it comes before are unmade.
@@ -181,26 +186,29 @@ class Assembly:
             self._undo(m.time)
             self._signals.insert(k, m)
         elif known:
-            place, k = (m.time, precedence(m.sensor), self._which[m.sensor], _name(m)), self._come
-            while k > 0 and self._place_of(k - 1) > place:
-                k -= 1
-            if k > 0 and self._place_of(k - 1) == place:
+            place = m.time, *self._rank[m.sensor], _name(m)
+            if place > self._last:
+                self._undo(m.time)
+                self._waiting.append(m)
+                self._last = place
+            elif not self._insert_before_others(m, place):
                 return InsertResult.AGAIN
-            self._undo(m.time)
-            self._insert_event(m, k)
+            if self._closes(m.sensor):
+                self._due = min(self._due, m.time - self.time_offsets.of_sensor(m.sensor))
         if self._no_imu:  # time goes on to it
             self._insert_sample(m.time, np.zeros(6), m.row)
         return InsertResult.IN
 
     def remove(self, sensor: str, since: float, settled: float) -> None:
         """Take back a sensor's measurements from a time on, but for what is before ``settled`` [s]."""
-        events = self._events[: self._come]
+        events = self._events
         wrong = (events[:, at.SENSOR] == self._which.get(sensor, -1)) & (events[:, at.STAMP] >= max(since, settled))
         if wrong.any():
             self._undo(float(events[wrong.argmax(), at.STAMP]))
             kept = events[~wrong]
             self._come = len(kept)
-            self._events[: self._come] = kept
+            self._listed[: self._come] = kept
+            self._last = self._place_of(self._come - 1)
             self._due = self._next_due()
 
     @property
@@ -209,6 +217,10 @@ class Assembly:
         return float(self._table[0, 0]) if len(self._table) else math.nan, self.newest
 
     # the keyframes
+
+    def is_due(self, until: float) -> bool:
+        """Whether a keyframe may be past by the samples up to a time [s], or some have been unmade."""
+        return min(until, self.newest) - self._rule.around >= self._due
 
     def extend(self, until: float = math.inf, one: bool = False, finish: bool = False) -> int:
         """Make the keyframes that are past by the samples up to a time; how many.
@@ -219,17 +231,18 @@ class Assembly:
         one : those of the first sample by which any is past
         finish : nothing else comes: place what is left, and a last keyframe at the last sample
         """
-        if not finish and min(until, self.newest) - self._rule.around < self._due:
+        if not finish and not self.is_due(until):
             return 0
         table = self._table
         count = len(table) if until >= self.newest else int(table[:, 0].searchsorted(until, side="right"))
         if not len(table):
             return 0
         begin, dive = len(self), self._dive
-        start = float(dive.keyframes[begin - 1, at.TIME] if begin else table[0, 0])
-        most = begin + len(self._closing()) + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
-        if most > len(dive.keyframes):
-            self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
+        start, upto = dive.keyframes[begin - 1, [at.TIME, at.UPTO]].tolist() if begin else (float(table[0, 0]), 0)
+        most = begin + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
+        waiting = dive.counts[at.ORDERED] - upto + len(self._events) - dive.counts[at.READ]
+        if most + waiting > len(dive.keyframes):
+            self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most + len(self._closing())))
         late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
         streams = self._streams
         at.place_keyframes(streams, late, self._rule, self._dive, count, one, finish)
@@ -242,7 +255,7 @@ class Assembly:
     def _assemble(self, begin: int, streams: at.Streams) -> None:
         """Fill what lies between the keyframes from ``begin`` on."""
         dive, n = self._dive, len(self)
-        pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._events[:0]
+        pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._listed[:0]
         first = int(dive.keyframes[begin - 1, at.UPTO]) if begin else 0
         own = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
         late = int(np.count_nonzero(self._sensors[own, at.LAG] >= 0)) if len(self._sensors) else 0
@@ -280,7 +293,7 @@ class Assembly:
         counts[at.ROWS] = int(last[at.TAKEN])
         counts[at.WINDOWS] = dive.of[at.WINDOW_OF, : counts[at.ROWS]].max(initial=-1) + 1
         self._no_pieces = [(k, why) for k, why in self._no_pieces if k < n]
-        self._due = self._next_due()
+        self._due = -math.inf
 
     def forget(self, n: int) -> None:
         """Forget the keyframes before ``n``, now and then and but for some, and what they were made of."""
@@ -295,14 +308,15 @@ class Assembly:
         time = float(dive.keyframes[n, at.TIME]) - self._rule.around - self._rule.every_s
         samples, rows = int(self._table[:, 0].searchsorted(time)), int(dive.keyframes[n - 1, at.TAKEN])
         upto, windows = int(dive.keyframes[n - 1, at.UPTO]), int(dive.of[at.WINDOW_OF, :rows].max(initial=-1)) + 1
-        gone = np.zeros(self._come, bool)
+        events = self._events
+        gone = np.zeros(len(events), bool)
         gone[self._order[:upto]] = True
-        gone |= (self._events[: self._come, at.FATE] >= at.REFUSED) & (self._events[: self._come, at.STAMP] < time)
+        gone |= (events[:, at.FATE] >= at.REFUSED) & (events[:, at.STAMP] < time)
         self._left_out += self._counted(gone)
         moved = np.cumsum(~gone) - 1
         order = moved[self._order[upto : counts[at.ORDERED]]]
         counts[at.READ] -= np.count_nonzero(gone[: counts[at.READ]])
-        self._events, self._come = self._events[: self._come][~gone], int((~gone).sum())
+        self._listed, self._come = events[~gone], int((~gone).sum())
         self._order = np.append(order, np.empty(self._come - len(order), np.int64))
         self._imu, self._samples = self._table[samples:].copy(), self._samples - samples
         self._left_out += Counter(("thruster", why) for k, why in self._no_pieces if k < n)
@@ -386,7 +400,7 @@ class Assembly:
         dive.counts[:] = 0
         dive.counts[[at.KEYFRAMES, at.FORGOTTEN]] = 2, known
         streams, rule = self._streams._replace(imu=table), self._rule._replace(learns=0.0)
-        at.assemble(streams, self._events[:0], rule, self._integration, dive, 1)
+        at.assemble(streams, self._listed[:0], rule, self._integration, dive, 1)
         return replace(self.problem, keyframes=dive.keyframes, motions=dive.motions[1:], scales=dive.scales[1:])
 
     # files and twins
@@ -405,7 +419,7 @@ class Assembly:
         return {
             **(more if whole else {}),
             "imu": twin._table,
-            "events": twin._events[: twin._come],
+            "events": twin._events,
             "order": twin._order[: counts[at.ORDERED]],
             "keyframes": twin._dive.keyframes[: len(twin)],
             "times": twin._dive.rows[: counts[at.ROWS], 0],
@@ -428,10 +442,11 @@ class Assembly:
         self._imu, self._samples, self._fresh = np.array(state["imu"], float), len(state["imu"]), []
         self.newest = float(self._imu[-1, 0])
         self._come, most = len(events), (events.shape[1] - at.VALUES) // 2
-        self._events = np.zeros((self._come, at.VALUES + 2 * self._most))
-        self._events[:, : at.VALUES + most] = events[:, : at.VALUES + most]
-        self._events[:, at.VALUES + self._most : at.VALUES + self._most + most] = events[:, at.VALUES + most :]
-        self._events[:, at.SENSOR] = number[events[:, at.SENSOR].astype(np.int64)]
+        self._listed, self._waiting = np.zeros((self._come, at.VALUES + 2 * self._most)), []
+        self._listed[:, : at.VALUES + most] = events[:, : at.VALUES + most]
+        self._listed[:, at.VALUES + self._most : at.VALUES + self._most + most] = events[:, at.VALUES + most :]
+        self._listed[:, at.SENSOR] = number[events[:, at.SENSOR].astype(np.int64)]
+        self._last = self._place_of(self._come - 1)
         self._order = np.append(np.array(state["order"], np.int64), np.empty(self._come, np.int64))
         n, m = int(counts[at.KEYFRAMES]), int(counts[at.ROWS])
         self._dive = self._room(n, m, int(counts[at.WINDOWS]))._replace(counts=counts)
@@ -453,9 +468,9 @@ class Assembly:
 
     def _twin(self) -> "Assembly":
         """One that goes on by itself from here."""
-        table, twin = self._table, copy(self)
-        twin._imu, twin._events, twin._order = table.copy(), self._events.copy(), self._order.copy()
-        twin._fresh, twin._signals, twin._no_pieces = [], self._signals[:], self._no_pieces[:]
+        table, events, twin = self._table, self._events, copy(self)
+        twin._imu, twin._listed, twin._order = table.copy(), events.copy(), self._order.copy()
+        twin._fresh, twin._waiting, twin._signals, twin._no_pieces = [], [], self._signals[:], self._no_pieces[:]
         twin._left_out, twin._dive = self._left_out.copy(), at.Dive._make(array.copy() for array in self._dive)
         return twin
 
@@ -463,11 +478,11 @@ class Assembly:
     def left_out(self) -> Counter[tuple[str, str]]:
         """(sensor, reason) -> count of measurements that never reach the graph."""
         pieces = Counter(("thruster", why) for _, why in self._no_pieces)
-        return self._left_out + self._counted(np.ones(self._come, bool)) + pieces
+        return self._left_out + self._counted(np.ones(len(self._events), bool)) + pieces
 
     def _counted(self, some: NDArray[np.bool_]) -> Counter[tuple[str, str]]:
         """Of some of the events, those that are left out."""
-        events = self._events[: self._come][some]
+        events = self._events[some]
         events = events[events[:, at.FATE] != at.IN][:, [at.SENSOR, at.FATE]].astype(np.int64)
         found, counts = np.unique(events, axis=0, return_counts=True) if len(events) else (events, events[:, 0])
         each = zip(found.tolist(), counts.tolist(), strict=True)
@@ -495,10 +510,23 @@ class Assembly:
         return self._imu[: self._samples]
 
     @property
+    def _events(self) -> Array:
+        """What has come, in the order of time, shape (e, VALUES + 2 D)."""
+        if self._waiting:
+            new, begin = self._waiting, self._come
+            self._waiting, self._come = [], begin + len(new)
+            self._listed = _grown(self._listed, begin, self._come)
+            for sensor in dict.fromkeys(m.sensor for m in new):
+                own = [k for k, m in enumerate(new) if m.sensor == sensor]
+                self._listed[begin + np.array(own)] = self._judged(sensor, [new[k] for k in own])
+        return self._listed[: self._come]
+
+    @property
     def _streams(self) -> at.Streams:
         """What has come, as kernels take it."""
-        self._order = _grown(self._order, int(self._dive.counts[at.ORDERED]), self._come)
-        return at.Streams(self._table, self._events[: self._come], self._order, self._sensors, self._steps)
+        events = self._events
+        self._order = _grown(self._order, int(self._dive.counts[at.ORDERED]), len(events))
+        return at.Streams(self._table, events, self._order, self._sensors, self._steps)
 
     def _room(self, keyframes: int, rows: int, windows: int) -> at.Dive:
         """Room for so many of each, nothing of which is there."""
@@ -540,34 +568,44 @@ class Assembly:
         params = preintegration_params(self.config)
         return at.Integration(params.row(self.bias, 0.0), mount_matrix(self.config.imu.mount_rpy_deg), padded)
 
+    def _closes(self, sensor: str) -> bool:
+        """Whether a keyframe stands where a sensor measures."""
+        return self._no_imu or sensor == "dvl"
+
     def _about(self, sensor: str) -> list[int]:
         """What kernels need to know of a sensor."""
         late = [s for s in self.names if self.time_offsets.lag(s) is not None]
-        closes = self._no_imu or sensor == "dvl"
         # the rate reaches these: by a lever arm, or by the motion of a turning body
         turned = self.instruments[sensor].rate_gain.any() or sensor == "thruster"
         numbers = self.instruments[sensor].model.dim, sensor == PLACE, late.index(sensor) if sensor in late else -1
-        return [int(closes), int(SENSORS[sensor].once_per_interval), int(turned), *map(int, numbers)]
+        return [int(self._closes(sensor)), int(SENSORS[sensor].once_per_interval), int(turned), *map(int, numbers)]
 
     # measurements and samples
 
-    def _insert_event(self, m: Measurement, k: int) -> None:
-        """Put a measurement at a place among those that have come."""
-        self._events = events = _grown(self._events, self._come, self._come + 1)
+    def _insert_before_others(self, m: Measurement, place: Place) -> bool:
+        """Put a measurement at its place among those that have come; False = it is there already."""
+        k = len(self._events)
+        while k > 0 and self._place_of(k - 1) > place:
+            k -= 1
+        if k > 0 and self._place_of(k - 1) == place:
+            return False
+        self._undo(m.time)
+        self._listed = events = _grown(self._listed, self._come, self._come + 1)
         events[k + 1 : self._come + 1] = events[k : self._come]
-        sensor, row = self._which[m.sensor], events[k]
-        row[:] = self._rows_of(m.sensor, np.array([m.time]), m.values[None], np.array([m.row]))[0]
+        events[k] = self._judged(m.sensor, [m])[0]
         self._come += 1
-        if SENSORS[m.sensor].refused is not none_refused:
-            refused: Counter[tuple[str, str]] = Counter()
-            if not admitted(m.sensor, m.values[None], self.config, refused)[0]:
-                ((_, why),) = refused
+        return True
+
+    def _judged(self, sensor: str, some: Sequence[Measurement]) -> Array:
+        """Events of a sensor's measurements, with why they are refused, if they are."""
+        values = np.array([m.values for m in some])
+        out = self._rows_of(sensor, np.array([m.time for m in some]), values, np.array([m.row for m in some]))
+        for why, bad in SENSORS[sensor].refused(values, self.config):
+            if bad.any():
                 if why not in self._reasons:
                     self._reasons.append(why)
-                row[at.FATE] = at.REFUSED + self._reasons.index(why)
-                return
-        if self._sensors[sensor, at.CLOSES]:
-            self._due = min(self._due, m.time - self.time_offsets.of_sensor(m.sensor))
+                out[bad & (out[:, at.FATE] == at.IN), at.FATE] = at.REFUSED + self._reasons.index(why)
+        return out
 
     def _rows_of(self, sensor: str, time: Array, values: Array, line: NDArray[np.int64]) -> Array:
         """Events of n measurements of a sensor, shape (n, VALUES + 2 D)."""
@@ -584,9 +622,11 @@ class Assembly:
         out[:, at.VALUES + D : at.VALUES + D + dim] = sd
         return out
 
-    def _place_of(self, k: int) -> tuple[float, int, int, float]:
+    def _place_of(self, k: int) -> Place:
         """Order of what has come: by time, and the DVL's before others."""
-        stamp, sensor, name = self._events[k, [at.STAMP, at.SENSOR, at.NAME]].tolist()
+        if k < 0:
+            return NEVER
+        stamp, sensor, name = self._listed[k, [at.STAMP, at.SENSOR, at.NAME]].tolist()
         return stamp, precedence(self.names[int(sensor)]), int(sensor), name
 
     def _insert_sample(self, time: float, values: Array, line: int) -> InsertResult:
@@ -614,7 +654,7 @@ class Assembly:
     def _undo(self, time: float) -> None:
         """Unmake what has been made of what comes after a time [s]."""
         counts = self._dive.counts
-        if counts[at.SAMPLES] and time < self._table[counts[at.SAMPLES] - 1, 0]:
+        if counts[at.SAMPLES] and time < self._imu[counts[at.SAMPLES] - 1, 0]:
             n = len(self)
             while n > 0 and self.closed_at(n - 1) > time:
                 n -= 1
@@ -628,11 +668,10 @@ class Assembly:
 
     def _closing(self) -> Array:
         """Times of what waits and may make a keyframe [s]."""
-        counts, events, n = self._dive.counts, self._events[: self._come], len(self)
+        counts, events, n = self._dive.counts, self._events, len(self)
         upto = int(self._dive.keyframes[n - 1, at.UPTO]) if n else 0
         late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
-        waits = np.concatenate([self._order[upto : counts[at.ORDERED]], np.arange(counts[at.READ], self._come)])
-        some = events[waits]
+        some = events[np.append(self._order[upto : counts[at.ORDERED]], np.arange(counts[at.READ], len(events)))]
         sensor = some[:, at.SENSOR].astype(np.int64)
         closes = (some[:, at.FATE] < at.REFUSED) & (self._sensors[sensor, at.CLOSES] != 0)
         return np.asarray((some[:, at.STAMP] - late[sensor])[closes])
@@ -681,7 +720,7 @@ class Assembly:
     def _pieces(self, begin: int) -> Array:
         """What thrusters tell of the intervals that end with keyframes from ``begin`` on, as events."""
         model = cast(ModelAiding, self.instruments["thruster"].model)
-        table, gone, out = self._table, int(self._dive.counts[at.FORGOTTEN]), [self._events[:0]]
+        table, gone, out = self._table, int(self._dive.counts[at.FORGOTTEN]), [self._listed[:0]]
         for k in range(begin, len(self)):
             (start, _), (end, count) = self._dive.keyframes[k - 1 : k + 1, [at.TIME, at.COUNT]].tolist()
             first = max(int(table[:, 0].searchsorted(start - HALF_WINDOW_S, side="right")) - 1, 0)

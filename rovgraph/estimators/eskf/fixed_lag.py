@@ -90,8 +90,9 @@ class FixedLag:
     def add(self, measurement: Measurement) -> InsertResult:
         """Take a measurement, whenever it arrives."""
         outcome = self.assembly.insert(measurement, self._settled)
-        if outcome == InsertResult.IN:
-            self._go_on(self.assembly.newest - self.hold_s)
+        until = self.assembly.newest - self.hold_s
+        if outcome == InsertResult.IN and self.assembly.is_due(until):
+            self._go_on(until)
         return outcome
 
     def retract(self, sensor: str, since: float) -> None:
