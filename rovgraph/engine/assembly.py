@@ -240,9 +240,10 @@ class Assembly:
         begin, dive = len(self), self._dive
         start, upto = dive.keyframes[begin - 1, [at.TIME, at.UPTO]].tolist() if begin else (float(table[0, 0]), 0)
         most = begin + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
-        waiting = dive.counts[at.ORDERED] - upto + len(self._events) - dive.counts[at.READ]
-        if most + waiting > len(dive.keyframes):
-            self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most + len(self._closing())))
+        waiting = int(dive.counts[at.ORDERED] - upto + len(self._events) - dive.counts[at.READ])
+        most += waiting if waiting < BUFFER else len(self._closing())
+        if most > len(dive.keyframes):
+            self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
         late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
         streams = self._streams
         at.place_keyframes(streams, late, self._rule, self._dive, count, one, finish)
@@ -516,8 +517,10 @@ class Assembly:
             new, begin = self._waiting, self._come
             self._waiting, self._come = [], begin + len(new)
             self._listed = _grown(self._listed, begin, self._come)
-            for sensor in dict.fromkeys(m.sensor for m in new):
-                own = [k for k, m in enumerate(new) if m.sensor == sensor]
+            places: dict[str, list[int]] = {}
+            for k, m in enumerate(new):
+                places.setdefault(m.sensor, []).append(k)
+            for sensor, own in places.items():
                 self._listed[begin + np.array(own)] = self._judged(sensor, [new[k] for k in own])
         return self._listed[: self._come]
 
