@@ -209,7 +209,7 @@ class Assembly:
             self._come = len(kept)
             self._listed[: self._come] = kept
             self._last = self._place_of(self._come - 1)
-            self._due = self._next_due()
+            self._due = -math.inf
 
     @property
     def span(self) -> tuple[float, float]:
@@ -240,17 +240,18 @@ class Assembly:
         begin, dive = len(self), self._dive
         start, upto = dive.keyframes[begin - 1, [at.TIME, at.UPTO]].tolist() if begin else (float(table[0, 0]), 0)
         most = begin + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
-        waiting = int(dive.counts[at.ORDERED] - upto + len(self._events) - dive.counts[at.READ])
-        most += waiting if waiting < BUFFER else len(self._closing())
+        most += int(dive.counts[at.ORDERED] - upto) + self._count_closing(int(dive.counts[at.READ]))
         if most > len(dive.keyframes):
             self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
         late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
         streams = self._streams
-        at.place_keyframes(streams, late, self._rule, self._dive, count, one, finish)
+        due = at.place_keyframes(streams, late, self._rule, self._dive, count, one, finish)
         made = len(self) - begin
         if made:
             self._assemble(begin, streams)
-        self._due = self._next_due()
+            start = float(self._dive.keyframes[len(self) - 1, at.TIME])
+            self._gaps = [time for time in self._gaps if time > start + at.SHORTEST_S]
+        self._due = min(due, *self._gaps, math.inf) - 1e-9
         return made
 
     def _assemble(self, begin: int, streams: at.Streams) -> None:
@@ -465,7 +466,7 @@ class Assembly:
         for period in state["periods"]:
             self._take_period(period)
         self.time_offsets.assumed.update(state["assumed"])
-        self._due = self._next_due()
+        self._due = -math.inf
 
     def _twin(self) -> "Assembly":
         """One that goes on by itself from here."""
@@ -669,25 +670,10 @@ class Assembly:
             self._periods.append(period)
             self._steps[len(self._periods) :] = GAP_PERIODS * float(np.median(self._periods))
 
-    def _closing(self) -> Array:
-        """Times of what waits and may make a keyframe [s]."""
-        counts, events, n = self._dive.counts, self._events, len(self)
-        upto = int(self._dive.keyframes[n - 1, at.UPTO]) if n else 0
-        late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
-        some = events[np.append(self._order[upto : counts[at.ORDERED]], np.arange(counts[at.READ], len(events)))]
-        sensor = some[:, at.SENSOR].astype(np.int64)
-        closes = (some[:, at.FATE] < at.REFUSED) & (self._sensors[sensor, at.CLOSES] != 0)
-        return np.asarray((some[:, at.STAMP] - late[sensor])[closes])
-
-    def _next_due(self) -> float:
-        """From when on a keyframe may be past, by what has come [s]."""
-        if not len(self):
-            return -math.inf
-        start = float(self._dive.keyframes[len(self) - 1, at.TIME])
-        closing = self._closing()
-        self._gaps = [time for time in self._gaps if time > start + at.SHORTEST_S]
-        soon = closing[closing - start >= self._rule.min_gap].min(initial=start + self._rule.longest)
-        return min(float(soon), *self._gaps, math.inf) - 1e-9
+    def _count_closing(self, begin: int) -> int:
+        """Events from one on that may make a keyframe."""
+        own = self._events[begin:, at.SENSOR].astype(np.int64)
+        return int(np.count_nonzero(self._sensors[own, at.CLOSES])) if len(own) else 0
 
     def _wanted(self, streams: Sequence[Stream]) -> Array:
         """Events of streams in the order of their stamps, without those of which one an interval is taken, where

@@ -285,10 +285,28 @@ def _finish(streams: Streams, dive: Dive, rule: Rule) -> None:
             events[order[k], FATE] = UNFINISHED
 
 
+@helper
+def _next_due(streams: Streams, assumed: Array, rule: Rule, dive: Dive) -> float:
+    """From when on a keyframe may be past, by the events that have come [s]."""
+    counts, events = dive.counts, streams.events
+    if counts[KEYFRAMES] == 0:
+        return -math.inf
+    last = dive.keyframes[counts[KEYFRAMES] - 1]
+    soon = last[TIME] + rule.longest
+    for k in range(int(last[UPTO]), counts[ORDERED] + len(events) - counts[READ]):
+        event = events[streams.order[k] if k < counts[ORDERED] else counts[READ] + k - counts[ORDERED]]
+        sensor = int(event[SENSOR])
+        if event[FATE] < REFUSED and streams.sensors[sensor, CLOSES] != 0:
+            placed = event[STAMP] - assumed[sensor]
+            if rule.min_gap <= placed - last[TIME] < soon - last[TIME]:
+                soon = placed
+    return float(soon)
+
+
 @kernel()
 def place_keyframes(
     streams: Streams, assumed: Vector, rule: Rule, dive: Dive, until: int, one: bool, finish: bool
-) -> None:
+) -> float:
     """Where keyframes stand, as samples come one after the other.
 
     Parameters
@@ -297,6 +315,10 @@ def place_keyframes(
     until : count of samples that may be looked at
     one : stop at the sample by which a keyframe is past
     finish : there are no more, so that what is left is placed
+
+    Returns
+    -------
+    From when on another keyframe may be past, by the events that have come [s]
     """
     imu, counts = streams.imu, dive.counts
     while counts[SAMPLES] < until:
@@ -311,15 +333,16 @@ def place_keyframes(
             _stand(dive, rule, time, early, 0)
             _look(streams, dive, rule, time - rule.around)
             if one:
-                return
+                break
         else:
             before = counts[KEYFRAMES]
             _look(streams, dive, rule, time - rule.around)
             if one and counts[KEYFRAMES] > before:
-                return
+                break
     if finish and counts[KEYFRAMES] > 0:
         _read(streams, assumed, math.inf, counts)
         _finish(streams, dive, rule)
+    return _next_due(streams, assumed, rule, dive)
 
 
 # what lies between them
