@@ -31,11 +31,11 @@ from rovgraph.diagnosis import (
 )
 from rovgraph.diagnosis.alarm import Alarm, alarm_of
 from rovgraph.diagnosis.evidence import SensorResiduals
-from rovgraph.diagnosis.rules import CHANCE, rule_table
 from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.engine.released import Released
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate, History
 from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
+from rovgraph.rules import CHANCE, rule_table
 from rovgraph.trajectory import Trajectory
 
 ALARMS = Path(__file__).parents[1] / "docs" / "alarms.md"

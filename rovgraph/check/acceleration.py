@@ -15,12 +15,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import CLIPPED, without_spikes
+from rovgraph.check.findings import without_spikes
 from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.check.lags import ORIENTATIONS, correlate, normal_equations, spread
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate
 from rovgraph.log import Stream
+from rovgraph.rules import CLIPPED
 
 FOLLOWS = 0.65  # agreement of accelerations that are of one motion
 BETTER = 2.0  # times smaller an error than as configured, which chance does not make

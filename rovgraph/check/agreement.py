@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
-from rovgraph.check.findings import BELIEVED_SDS, Finding, integral, valid_pings, without_spikes
+from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
 from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
@@ -20,6 +20,7 @@ from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
 from rovgraph.log.units import turn_angles
+from rovgraph.rules import BELIEVED_SDS
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]

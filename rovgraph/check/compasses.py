@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import CLIPPED, Finding
+from rovgraph.check.findings import Finding
 from rovgraph.check.inertial import BIAS_SD, GAP, InertialMotion, in_gap, inertial_motion, means, smoothed
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Signal, fit
@@ -25,6 +25,7 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, cross, rotate, skew
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
+from rovgraph.rules import CLIPPED
 
 COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading themselves
 OFFSETS = {

@@ -9,12 +9,13 @@ import numpy as np
 
 from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Fit, Search
 from rovgraph.check.agreement import dives_with_depth
-from rovgraph.check.findings import BELIEVED_SDS, SURE, Finding
+from rovgraph.check.findings import Finding
 from rovgraph.check.jumps import Examined, compare, find_jump
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
+from rovgraph.rules import BELIEVED_SDS, SURE
 from rovgraph.sensors.dvl import axes_remedy
 
 SIMILAR = 1.1  # times the least error, that tells two orientations apart no more

@@ -13,10 +13,6 @@ from rovgraph.sensors import Fault, Kind, Level
 
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 CLOCKS: tuple[Kind, ...] = ("epoch", "lag", "jump")
-# limits of all checks, and of what an estimate contradicts
-SURE = 5.0  # standard deviations, from which on an error is no chance
-BELIEVED_SDS = 3.0  # of what the configuration believes to be uncertain, within which that explains an error
-CLIPPED = 4.0  # times the median residual, which counts no more
 SPIKE = 6.0  # times the usual distance from the median of five
 LEAST_SPIKE = 0.1  # [m/s, m]
 

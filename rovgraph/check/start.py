@@ -8,10 +8,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import SURE, Finding, valid_pings
+from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.rules import SURE
 
 FIRST = 5  # fixes, of which the median counts
 ENOUGH = 3  # fixes

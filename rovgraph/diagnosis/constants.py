@@ -9,12 +9,12 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
-from rovgraph.diagnosis.rules import RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
+from rovgraph.rules import RULES
 from rovgraph.units import behind, shown
 
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated

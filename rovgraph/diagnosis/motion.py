@@ -8,9 +8,9 @@ from scipy.special import chdtri
 from rovgraph.calibration import TABLE
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
-from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.rules import CHANCE, RULES
 from rovgraph.trajectory import Trajectory
 
 IMU_S = 20.0  # over which errors of the IMU last that are no noise

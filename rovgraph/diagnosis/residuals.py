@@ -15,14 +15,13 @@ from scipy.special import bdtrc, chdtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
-from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.geometry import Array
+from rovgraph.rules import CHANCE, RULES, USUAL_SHARE
 
 ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
-USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 IN_A_MINUTE = 1.5  # times as much
 SETTLED_S = 20.0  # from which on the filter is asked
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive

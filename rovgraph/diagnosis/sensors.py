@@ -5,7 +5,7 @@ from itertools import combinations
 
 from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.evidence import Evidence, span
-from rovgraph.diagnosis.rules import RULES, Severity
+from rovgraph.rules import RULES, Severity
 
 MEASURE_THE_SAME = (
     ("heading", ("mag", "dvl_heading", "ahrs")),

@@ -24,7 +24,6 @@ from rovgraph.diagnosis.residuals import (
     too_large_in,
     too_small_in,
 )
-from rovgraph.diagnosis.rules import RULES
 from rovgraph.diagnosis.sensors import frozen_for
 from rovgraph.diagnosis.stretches import taken_out_in
 from rovgraph.engine.filter import FilterEngine
@@ -37,6 +36,7 @@ from rovgraph.geometry import Array
 from rovgraph.live.faults import Watch
 from rovgraph.live.reinitialisations import Adopted
 from rovgraph.live.solution import Event
+from rovgraph.rules import RULES
 from rovgraph.state import BIAS, PLACE
 
 EVERY_S = 5.0  # between looks

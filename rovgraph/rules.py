@@ -1,18 +1,25 @@
-"""The one table of what can be wrong with a dive: each rule's figure, its limits, and how often it errs.
+"""The rule book: what can be wrong with a dive, before its estimate, after it, and while it goes on.
 
-Check, `smooth` and `online` take their limits from `RULES`, and docs/alarms.md prints it. A figure beyond ``doubtful``
-or ``wrong`` is an alarm, and the worst alarm is the verdict. What is better than stated is advice: it is no evidence of
-error, and no part of the verdict.
+`RULES` are the figures of the verdict, with their limits and how often they err (docs/alarms.md prints it),
+`COMPARISONS` what two sensors show by their motion, in a log and live (docs/check.md). Where one question has several
+numbers, they stand here beside each other, with the reason. `rovgraph.log.frozen.HOLDS` is the table of frozen sensors.
+
+A figure beyond ``doubtful`` or ``wrong`` is an alarm, and the worst alarm is the verdict. What is better than stated is
+advice: it is no evidence of error, and no part of the verdict.
 """
 
 from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Literal
 
-from rovgraph.check.findings import SURE
-from rovgraph.log.frozen import HOLD
+from rovgraph.log.frozen import HOLD, SURE
 
 Severity = Literal["advice", "doubtful", "wrong"]
+
+BELIEVED_SDS = 3.0  # of what the configuration believes to be uncertain, within which that explains an error
+CLIPPED = 4.0  # times the median residual, which counts no more
+CHANCE = 1e-6  # that a figure of a healthy sensor is beyond a limit that is a quantile of its distribution
+USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,6 @@ class Rule:
             return "advice" if self.advice else "doubtful"
         return None
 
-
-CHANCE = 1e-6  # that a figure of a healthy sensor is beyond a limit that is a quantile of its distribution
 
 _ROWS = (
     Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="as a `check` event"),
