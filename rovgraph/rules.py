@@ -20,6 +20,12 @@ BELIEVED_SDS = 3.0  # of what the configuration believes to be uncertain, within
 CLIPPED = 4.0  # times the median residual, which counts no more
 CHANCE = 1e-6  # that a figure of a healthy sensor is beyond a limit that is a quantile of its distribution
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
+CONTRADICTED = 0.1  # of a sensor's measurements, rejected: its axes, or a mounting that is held, may be the cause
+BENT = 0.3  # of the same: what would let it in again, residuals and gates do not show
+SETTLED_S = 10.0  # of a dive, before which its filter is not asked
+# without a measurement, the longer of the two: an event for a person live; `log.streams.GAP_PERIODS` are a gap of a log
+SILENT_S, SILENT_PERIODS = 3.0, 10.0
+EPOCH_SD_S = 0.5  # of what motion shows of clocks that are any time apart, to be believed
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Rule:
     live : how `rovgraph online` has it; empty = not at all
     advice : the figure says that something is better than stated, which is advice
     looks : live, for how many looks in a row the figure is beyond its limit before it is said
+    from_s : of a dive, before which its filter, or the dive so far, is not asked [s]
     """
 
     kind: str
@@ -45,6 +52,7 @@ class Rule:
     live: str = ""
     advice: bool = False
     looks: int = 1
+    from_s: float = SETTLED_S
 
     def __post_init__(self) -> None:
         """Refuse limits by which a rule can never, or must always, speak.
@@ -69,23 +77,35 @@ class Rule:
 
 _ROWS = (
     Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="as a `check` event"),
-    Rule("clock", "the same, over that with shifted stamps", 1.15, 1.15, live="as a `clock` event"),
-    Rule("check", "findings of the check that the data are wrong, and that nothing has mended", 0.0, rate=0.0),
+    # live, by the motion of the last minutes: looks are windows
     Rule(
-        "innovations",
-        "mean square of the filter's innovations, in their stated sds",
-        4.0,
-        25.0,
-        live="as too large",
+        "clock", "the same, over that with shifted stamps", 1.15, 1.15, live="as a `clock` event", looks=2, from_s=60.0
     ),
+    Rule(
+        "check",
+        "findings of the check that the data are wrong, and that nothing has mended",
+        0.0,
+        rate=0.0,
+        live="as a `check` event",
+        looks=3,
+        from_s=60.0,
+    ),
+    Rule("innovations", "mean square of the filter's innovations, in their stated sds", 4.0, 25.0, live="as too large"),
     Rule(
         "filter alone",
         "share of a sensor's measurements that the filter rejected and the smoother took",
         0.05,
         rate=1e-3,
+        from_s=20.0,
     ),
+    # what was held wrongly for less than a minute shows little
     Rule(
-        "held", "error of a constant that is not estimated, in its sds", SURE, 30.0, live="of the smoothed dive so far"
+        "held",
+        "error of a constant that is not estimated, in its sds",
+        SURE,
+        30.0,
+        live="of the smoothed dive so far",
+        from_s=60.0,
     ),
     Rule(
         "moved", "shift of an estimated variable or a first bias, in sds of that shift", 4.0, 10.0, 1.6e-3, live="now"
@@ -113,8 +133,15 @@ _ROWS = (
         live="of the last minute",
         looks=3,
     ),
+    # live, innovations wander while the calibration settles
     Rule(
-        "lasting", "variance of means over 5 or 20 s, 1 for white noise", 4.0, 100.0, live="of the last minute", looks=3
+        "lasting",
+        "variance of means over 5 or 20 s, 1 for white noise",
+        4.0,
+        100.0,
+        live="of the last minute",
+        looks=3,
+        from_s=60.0,
     ),
     # healthy simulated dives have up to 1.1, a right recorded one of a MEMS gyro at 10 Hz has 5, faults 6 and more
     Rule("imu", "the same of the IMU's own residuals, over 20 s", 6.0, 50.0),
@@ -143,7 +170,13 @@ _ROWS = (
         rate=1e-3,
     ),
     Rule("halves", "difference of a constant between the halves of the dive, in sds", 10.0, 30.0),
-    Rule("unstated", "noise, an error that lasts, or another place of the DVL, found but not used", 0.0, live="only"),
+    Rule(
+        "unstated",
+        "noise, an error that lasts, or another place of the DVL, found but not used",
+        0.0,
+        live="only",
+        from_s=60.0,
+    ),
     Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="of both alarms"),
 )
 RULES = {rule.kind: rule for rule in _ROWS}
@@ -151,9 +184,10 @@ RULES = {rule.kind: rule for rule in _ROWS}
 
 def rule_table() -> str:
     """`RULES` as a table in Markdown, as docs/alarms.md has it."""
-    never, rows = "–", ["| kind | figure | doubtful | wrong | rate | live |", "|---|---|---|---|---|---|"]
+    never, rows = "–", ["| kind | figure | doubtful | wrong | rate | live | from |", "|---|---|---|---|---|---|---|"]
     for r in RULES.values():
         lower = f"{r.doubtful:.3g}" + " (advice)" * r.advice
+        settled = "" if r.from_s == SETTLED_S else f"{r.from_s:g} s"
         higher = never if r.wrong == inf else f"{r.wrong:.3g}"
-        rows.append(f"| `{r.kind}` | {r.figure} | {lower} | {higher} | {r.rate:g} | {r.live or never} |")
+        rows.append(f"| `{r.kind}` | {r.figure} | {lower} | {higher} | {r.rate:g} | {r.live or never} | {settled} |")
     return "\n".join(rows)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.findings import without_spikes
-from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
+from rovgraph.check.inertial import GAP_PERIODS, LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.check.lags import ORIENTATIONS, correlate, normal_equations, spread
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate
@@ -28,7 +28,6 @@ BETTER = 2.0  # times smaller an error than as configured, which chance does not
 WINDOW = 1.0  # over which velocities change, at least two pings [s]
 LARGEST_LAG = 300.0  # that is searched for [s]
 OVERLAP = 0.6  # of the dive, that a shift leaves
-LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
 ENOUGH_PINGS = 30
 BURST = 5  # pings that a serial buffer may hold back
@@ -145,7 +144,7 @@ class Comparison:
     @property
     def longest(self) -> float:
         """Between two pings that are interpolated [s]."""
-        return max(LONGEST_PING_GAP * self.period, 1.0)
+        return max(GAP_PERIODS * self.period, 1.0)
 
     def search(self, largest: float = LARGEST_LAG, during: tuple[float, float] = ALWAYS) -> Search:
         """Every orientation at every lag, by the IMU's samples between two times."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
-from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
+from rovgraph.check.findings import Finding, valid_pings, without_spikes
 from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
@@ -19,6 +19,8 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import downwards
+from rovgraph.log.streams import integral
 from rovgraph.log.units import turn_angles
 from rovgraph.rules import BELIEVED_SDS
 
@@ -88,7 +90,7 @@ def _heading_lag(gyro: Signal, by_gyro: Signal, heading: Signal) -> Lag:
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
     """Integrated rate about the body's z axis [rad]."""
     rate_b = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])
-    return Signal(imu.time, integral(imu, rate_b[:, 2]))
+    return Signal(imu.time, integral(imu.time, rate_b[:, 2]))
 
 
 def _heading_by_gyro(log: Log, config: Config, motion: InertialMotion | None) -> Signal:
@@ -236,7 +238,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     pings = valid_pings(log["dvl"])
     if len(pings) < MIN_WINDOWS:
         return
-    down = _downwards(log["imu"], config, pings.time)
+    down = downwards(log["imu"], config, pings.time)
     depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
@@ -276,7 +278,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
     """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
-    way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
+    way = integral(pings.time, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
     depth, dvl = without_spikes(log["depth"]), Signal(pings.time, way)
     return _without_steps(Signal(depth.time, depth["depth"]), dvl, window), dvl, window
@@ -296,7 +298,7 @@ def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
     if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
         return 0.0
     pings = valid_pings(log["dvl"])
-    f = fit(*_descents(log, pings, R_bs, _downwards(log["imu"], config, pings.time)))
+    f = fit(*_descents(log, pings, R_bs, downwards(log["imu"], config, pings.time)))
     return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 
@@ -313,24 +315,3 @@ def _flip(config: Config) -> str:
     roll, pitch, yaw = config.dvl.mount_rpy_deg
     turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
     return f"if the DVL's z axis points {points}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}]"
-
-
-def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:
-    """Unit vector of gravity in body axes from the mean specific force around each time.
-
-    Parameters
-    ----------
-    time : ndarray, shape (m,)
-    span : averaged over so long [s]
-
-    Returns
-    -------
-    ndarray, shape (m, 3)
-    """
-    R_bs = mount_matrix(config.imu.mount_rpy_deg)
-    total = np.vstack([np.zeros(3), np.cumsum(imu.data[:, :3], axis=0)])
-    low = np.searchsorted(imu.time, time - span / 2).clip(0, len(imu) - 1)
-    high = np.maximum(np.searchsorted(imu.time, time + span / 2), low + 1)
-    f_b = rotate(R_bs, (total[high] - total[low]) / (high - low)[:, None])
-    out: Array = -f_b / np.maximum(np.linalg.norm(f_b, axis=1, keepdims=True), 1e-9)
-    return out

@@ -14,8 +14,7 @@ from rovgraph.check.jumps import compare
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config
 from rovgraph.log import Log
-
-SURE_S = 0.5  # sd of a shift that is said [s]
+from rovgraph.rules import EPOCH_SD_S
 
 
 def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -29,7 +28,7 @@ def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float]
     moved = replace(log[sensor], time=log[sensor].time - apart)
     beside = replace(log, streams={"imu": log["imu"], sensor: moved})
     lag = _dvl_lag(beside, config) if sensor == "dvl" else heading_lag(beside, config, sensor)
-    if lag is None or not lag[1] < SURE_S:
+    if lag is None or not lag[1] < EPOCH_SD_S:
         return None
     return apart + lag[0], lag[1]
 

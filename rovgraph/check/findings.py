@@ -146,14 +146,3 @@ def since(log: Log, time: float) -> str:
     """
     start = min((float(s.time[0]) for s in log.streams.values()), default=0.0)
     return f"{time - start:.1f} s"
-
-
-def integral(stream: Stream, values: Array) -> Array:
-    """Trapezoidal integral of values over a stream's time from its start, same shape as values.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-    """
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(stream.time)
-    return np.concatenate([[0.0], np.cumsum(steps)])

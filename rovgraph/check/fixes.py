@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.compasses import OFFSETS, body_heading
+from rovgraph.check.compasses import body_heading
 from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
-from rovgraph.instruments import DEFAULT_DIP, heading_sources
+from rovgraph.instruments import DEFAULT_DIP, OFFSETS, heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.streams import LAT_LON
 from rovgraph.rules import BELIEVED_SDS, CLIPPED, SURE

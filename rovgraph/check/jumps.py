@@ -10,7 +10,7 @@ import numpy as np
 
 from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Search
 from rovgraph.check.findings import Finding, since, valid_pings
-from rovgraph.check.inertial import inertial_motion
+from rovgraph.check.inertial import GAP, GAP_PERIODS, inertial_motion
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config
@@ -24,7 +24,6 @@ JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
 LARGEST_JUMP = 120.0  # [s]
 PIECE = 30.0  # shortest part of a dive that shows a lag [s]
 GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
-GAP = 0.5  # [s]
 MOST_JUMPS = 5  # of one dive, that are bridged
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
@@ -191,5 +190,5 @@ def _gaps(stream: Stream) -> list[Jump]:
     periods = np.diff(stream.time)
     widest = np.argsort(periods)[-GAPS:]
     period = float(np.median(periods))
-    wide = widest[periods[widest] > max(GAP, 2.5 * period)]
+    wide = widest[periods[widest] > max(GAP, GAP_PERIODS * period)]
     return [Jump(stream.sensor, float(stream.time[k]), float(stream.time[k + 1]), period) for k in wide]

@@ -12,6 +12,7 @@ from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.streams import integral
 from rovgraph.rules import SURE
 
 FIRST = 5  # fixes, of which the median counts
@@ -50,5 +51,4 @@ def _way(speed: Array, time: Array, begin: float, at: Array) -> Array:
     """Length of the way since ``begin`` [m], before the first ping at its speed."""
     when = np.unique(np.concatenate([[begin], time, at]))
     v = np.interp(when, time, speed)
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(when))])
-    return np.asarray(np.interp(at, when, way))
+    return np.asarray(np.interp(at, when, integral(when, v)))

@@ -25,9 +25,9 @@ from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array, cross, rotate, transpose
 from rovgraph.kernels import motion_row
 from rovgraph.log import Log
+from rovgraph.rules import CONTRADICTED
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
-SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
 OVER_S = 3.0  # T
 SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
 CLIPPED = 3.0  # times the median error, beyond which an error counts no more
@@ -38,7 +38,7 @@ UNTIL_THEN = "until that is mended the track is wrong"
 def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
     best, config = evidence.optimum, evidence.initial.config
-    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < SUSPICIOUS:
+    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < CONTRADICTED:
         return
     compared = _Compared.of(best, best.blocks["dvl"])
     if compared is None:

@@ -23,7 +23,6 @@ from rovgraph.rules import CHANCE, RULES, USUAL_SHARE
 ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
 IN_A_MINUTE = 1.5  # times as much
-SETTLED_S = 20.0  # from which on the filter is asked
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
 REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are no fault, or have a rule
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
@@ -194,7 +193,7 @@ def filter_alone(evidence: Evidence) -> Iterator[Statistic]:
         taken = evidence.residuals.get(sensor)
         if taken is None or len(taken.time) != len(met.time) or len(met.time) < ENOUGH:
             continue
-        late = met.time > evidence.start + SETTLED_S
+        late = met.time > evidence.start + RULES["filter alone"].from_s
         apart = (met.weight <= 0.0) & (taken.weight > 0.0) & late
         share = float(share_rejected(np.array([apart.sum()]), np.array([late.sum()]))[0])
         first, last = (float(t) for t in (met.time[apart][[0, -1]] if apart.any() else (evidence.start, evidence.end)))
