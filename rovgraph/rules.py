@@ -10,8 +10,9 @@ advice: it is no evidence of error, and no part of the verdict.
 
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from rovgraph.config import Config
 from rovgraph.log.frozen import HOLD, SURE
 
 Severity = Literal["advice", "doubtful", "wrong"]
@@ -26,6 +27,42 @@ SETTLED_S = 10.0  # of a dive, before which its filter is not asked
 # without a measurement, the longer of the two: an event for a person live; `log.streams.GAP_PERIODS` are a gap of a log
 SILENT_S, SILENT_PERIODS = 3.0, 10.0
 EPOCH_SD_S = 0.5  # of what motion shows of clocks that are any time apart, to be believed
+
+
+class MotionLimits(NamedTuple):
+    """When two sensors show one motion, in a log or live, and when the stamps of one are late.
+
+    Attributes
+    ----------
+    compared : what of both
+    follows : agreement or correlation of one motion, at most 1
+    lag_s, sds : from which on a lag is said: itself [s], and in its own sds
+    evidence : in chi-square, that the lag explains
+    reach_s : largest lag that is searched for [s]
+    """
+
+    compared: str
+    follows: float
+    lag_s: float
+    sds: float
+    evidence: float
+    reach_s: float
+
+    def is_late(self, lag: float, sd: float, believed: tuple[float, float]) -> bool:
+        """Whether a lag is neither what is believed, a mean and its sd, nor chance [s]."""
+        off = abs(lag - believed[0])
+        return off > max(self.lag_s, BELIEVED_SDS * believed[1]) and off > self.sds * sd
+
+
+FOLLOWS, REACH_S = 0.7, 300.0  # correlation of changes within windows, and how far these are shifted [s]
+# pings are fitted one by one, so a small lag stands out
+ACCELERATION = MotionLimits("acceleration by DVL and IMU", 0.65, 0.05, SURE, 30.0, REACH_S)
+# windows of seconds show no small lag; their sd comes from leaving out parts of the dive
+TURNING = MotionLimits("turning by compass and gyro", FOLLOWS, 0.3, 3.0, 2.0, REACH_S)
+DESCENT = TURNING._replace(compared="descent by DVL and depth", evidence=12.0)  # waves are alike after a period
+# fixes are seldom, and scatter
+TRACK = MotionLimits("track by DVL and fixes", 0.6, 0.5, SURE, 40.0, 60.0)
+COMPARISONS = (ACCELERATION, TURNING, DESCENT, TRACK)
 
 
 @dataclass(frozen=True)
@@ -182,6 +219,15 @@ _ROWS = (
 RULES = {rule.kind: rule for rule in _ROWS}
 
 
+def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
+    """What mends stamps that are late [s]: a known delay is stated; a DVL's is estimated, as its pings show it well."""
+    if sensor == "dvl":
+        entry = f"{{estimate: true, mean: {lag:.3f}, sd: {max(0.02, 3.0 * sd):.2f}}}"
+        return f"correct its clock, or state calibration.dvl_time_offset: {entry}"
+    delay = f"state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + lag:.2g}}}"
+    return f"{delay}, or correct fix.lever_arm_m" if sensor == "fix" else delay  # under way the two look alike
+
+
 def rule_table() -> str:
     """`RULES` as a table in Markdown, as docs/alarms.md has it."""
     never, rows = "–", ["| kind | figure | doubtful | wrong | rate | live | from |", "|---|---|---|---|---|---|---|"]
@@ -191,3 +237,10 @@ def rule_table() -> str:
         higher = never if r.wrong == inf else f"{r.wrong:.3g}"
         rows.append(f"| `{r.kind}` | {r.figure} | {lower} | {higher} | {r.rate:g} | {r.live or never} | {settled} |")
     return "\n".join(rows)
+
+
+def comparison_table() -> str:
+    """`COMPARISONS` as a table in Markdown, as docs/check.md has it."""
+    head = "| compared | one motion from | lag from [s] | of its sds | chi-square | searched to [s] |"
+    rows = (f"| {c.compared} | " + " | ".join(f"{number:g}" for number in c[1:]) + " |" for c in COMPARISONS)
+    return "\n".join([head, "|---|---|---|---|---|---|", *rows])

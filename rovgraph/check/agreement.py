@@ -3,26 +3,24 @@
 Each comparison takes what two sensors say of the change within windows of some seconds (`rovgraph.check.signals`).
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
-from rovgraph.check.findings import Finding, valid_pings, without_spikes
+from rovgraph.check.findings import Finding, believed_lag, valid_pings, without_spikes
 from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
-from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
+from rovgraph.check.signals import MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
-from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
-from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import downwards
 from rovgraph.log.streams import integral
 from rovgraph.log.units import turn_angles
-from rovgraph.rules import BELIEVED_SDS
+from rovgraph.rules import DESCENT, FOLLOWS, TURNING, MotionLimits, remedy_of_lag
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
@@ -31,8 +29,6 @@ LEAST_STEP = 0.3  # of a depth whose zero is set anew [m]
 STEPS = 10.0  # times its usual change against the DVL's way
 MOST_STEPS = 3
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
-EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
-WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
 LEAST_LEVEL = 0.1  # cos(pitch)^2 below which a heading turns at any rate
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading", "vehicle_heading": "heading"}
 ZEROS = {"enu": "east", "nwu": "north"}  # of headings that count anticlockwise
@@ -62,10 +58,9 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         yield _turning(log, config, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), heading)
-            delay = config.delay_s.get(sensor, 0.0) + found.seconds
-            remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
-            turn = f"the turning of {NAMES[sensor]}"
-            yield from _clock(sensor, turn, "the gyro's", found, EVIDENCE, remedy, _stated(config, found, sensor))
+            remedy = f"if it is late, {remedy_of_lag(config, sensor, found.seconds, found.sd)}"
+            turn, believed = f"the turning of {NAMES[sensor]}", believed_lag(config, sensor)
+            yield from _clock(sensor, turn, "the gyro's", found, TURNING, believed, remedy)
 
 
 def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -206,25 +201,15 @@ def _if_degrees(sensor: str) -> str:
     return f"if it is in degrees, state units: {{{sensor.removeprefix('vehicle_')}: deg}}"
 
 
-def _stated(config: Config, found: Lag, late: str, than: str | None = None) -> bool:
-    """Whether a lag of one sensor, than another, is what the configuration states or lets an estimate find."""
-    priors, every = beliefs(config), instruments(config)
-    own, other = (None if sensor is None else every[sensor].time_offset for sensor in (late, than))
-    known = {name: sign for name, sign in ((own, 1.0), (other, -1.0)) if name is not None}
-    offset = sum(sign * float(priors[name].mean[0]) for name, sign in known.items())
-    sd = math.hypot(*(priors[name].sd for name in known if priors[name].estimate))
-    return (offset != 0.0 or sd > 0.0) and abs(found.seconds - offset) < max(LAG_WARNING, BELIEVED_SDS * sd)
-
-
 def _clock(
-    sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str, stated: bool
+    sensor: str, what: str, against: str, found: Lag, limits: MotionLimits, believed: tuple[float, float], remedy: str
 ) -> Iterator[Finding]:
-    """A lag, if there is one that is not stated."""
+    """A lag, if there is one that is not believed."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
-    if found.significant(evidence) and not stated:
+    if limits.is_late(found.seconds, found.sd, believed) and found.evidence > limits.evidence:
         text = f"{what} comes {later}{sd}: the clocks disagree, or a filter delays it; {remedy}"
         yield Finding(sensor, "warning", text, "lag")
     else:
@@ -271,9 +256,8 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "warning", text, "scale")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
-    stated = _stated(config, behind, "dvl", than="depth")
-    against, remedy = "the change of depth", "check the clocks of both"
-    yield from _clock("dvl", "vertical velocity", against, behind, WAVE_EVIDENCE, remedy, stated)
+    against, believed = "the change of depth", believed_lag(config, "dvl", than="depth")
+    yield from _clock("dvl", "vertical velocity", against, behind, DESCENT, believed, "check the clocks of both")
 
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from rovgraph.check.findings import Finding
 from rovgraph.check.inertial import BIAS_SD, GAP, GAP_PERIODS, InertialMotion, in_gap, inertial_motion, means, smoothed
 from rovgraph.check.lags import ORIENTATIONS
-from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Signal, fit
+from rovgraph.check.signals import MIN_WINDOWS, Signal, fit
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, cross, rotate, skew
 from rovgraph.instruments import OFFSETS, heading_sources
 from rovgraph.log import Log, Stream
-from rovgraph.rules import CLIPPED
+from rovgraph.rules import CLIPPED, FOLLOWS
 
 COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading themselves
 FOLLOWS_GYRO = 10.0  # before and after, over which a magnetometer's heading is averaged against the gyro's [s]

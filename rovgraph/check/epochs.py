@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import FOLLOWS
 from rovgraph.check.agreement import heading_lag
 from rovgraph.check.jumps import compare
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config
 from rovgraph.log import Log
-from rovgraph.rules import EPOCH_SD_S
+from rovgraph.rules import ACCELERATION, EPOCH_SD_S
 
 
 def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -40,7 +39,7 @@ def _dvl_lag(log: Log, config: Config) -> tuple[float, float] | None:
         return None
     found = compared.search()
     k = int(np.argmin(found.error[0]))
-    if found.agreement[0, k] < FOLLOWS:
+    if found.agreement[0, k] < ACCELERATION.follows:
         return None
     fit = compared.refine(float(found.lags[k]), ORIENTATIONS[0])
     return None if fit is None else (fit.lag, fit.lag_sd)

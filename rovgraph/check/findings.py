@@ -1,13 +1,14 @@
 """What a check has to say, and helpers that the checks share."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 import numpy as np
 
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.geometry import Array
-from rovgraph.instruments import HEADING_STREAMS, heading_sources
+from rovgraph.instruments import HEADING_STREAMS, heading_sources, instruments
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Fault, Kind, Level
 
@@ -112,6 +113,15 @@ def _without_nan(value: object) -> Any:
     if isinstance(value, list):
         return [_without_nan(v) for v in value]
     return None if isinstance(value, float) and value != value else value
+
+
+def believed_lag(config: Config, late: str, than: str | None = None) -> tuple[float, float]:
+    """How much later the stamps of a sensor are believed to be than another's or the IMU's, and its sd [s]."""
+    priors, every = beliefs(config), instruments(config)
+    offsets = [(sign, every[name].time_offset) for sign, name in ((1.0, late), (-1.0, than)) if name is not None]
+    known = [(sign, priors[name]) for sign, name in offsets if name is not None]
+    sd = math.hypot(*(prior.sd for _, prior in known if prior.estimate))
+    return sum(sign * float(prior.mean[0]) for sign, prior in known), sd
 
 
 def told(stream: Stream) -> Array:

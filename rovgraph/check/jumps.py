@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Search
+from rovgraph.check.acceleration import BETTER, Comparison, Search
 from rovgraph.check.findings import Finding, since, valid_pings
 from rovgraph.check.inertial import GAP, GAP_PERIODS, inertial_motion
 from rovgraph.check.lags import ORIENTATIONS
@@ -18,6 +18,7 @@ from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
 from rovgraph.log.beams import BEAMS
 from rovgraph.log.frozen import false_values, without
+from rovgraph.rules import ACCELERATION
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
@@ -114,7 +115,7 @@ def find_jump(log: Log, compared: Comparison) -> Jump | None:
         sides = [compared.search(reach, span) for span in spans]
         best = [int(np.argmin(side.error[0])) for side in sides]
         lags = [float(side.lags[k]) for side, k in zip(sides, best, strict=True)]
-        if not all(side.agreement[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True)):
+        if not all(side.agreement[0, k] > ACCELERATION.follows for side, k in zip(sides, best, strict=True)):
             continue
         worse = [
             side.error[0, _index(side, lag)] / side.error[0, k]
