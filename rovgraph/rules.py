@@ -28,6 +28,11 @@ SETTLED_S = 10.0  # of a dive, before which its filter is not asked
 SILENT_S, SILENT_PERIODS = 3.0, 10.0
 EPOCH_SD_S = 0.5  # of what motion shows of clocks that are any time apart, to be believed
 
+START_REMEDY = (
+    "correct start.north_m and start.east_m, or leave them to the first fix; check the fixes' origin and, of a USBL, "
+    "the ship's heading; or raise start.position_sd_m"
+)
+
 
 class MotionLimits(NamedTuple):
     """When two sensors show one motion, in a log or live, and when the stamps of one are late.

@@ -21,6 +21,7 @@ from rovgraph.log.frozen import downwards
 from rovgraph.log.streams import integral
 from rovgraph.log.units import turn_angles
 from rovgraph.rules import DESCENT, FOLLOWS, TURNING, MotionLimits, remedy_of_lag
+from rovgraph.sensors.dvl import other_way_up
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
@@ -243,7 +244,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding(
             "dvl",
             "warning",
-            f"vertical velocity and the change of depth have opposite signs ({numbers}): {_flip(config)}; "
+            f"vertical velocity and the change of depth have opposite signs ({numbers}): {other_way_up(config)}; "
             "if depth counts upwards, state units: {depth: -m}",
             "sign",
         )
@@ -292,10 +293,3 @@ def _depth_noise(depth: Signal, config: Config, window: float) -> float:
         return config.depth.sd_m
     shown = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
     return float(max(config.depth.sd_m, shown))
-
-
-def _flip(config: Config) -> str:
-    """A hint at a DVL that is mounted the other way up."""
-    roll, pitch, yaw = config.dvl.mount_rpy_deg
-    turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
-    return f"if the DVL's z axis points {points}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}]"

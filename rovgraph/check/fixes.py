@@ -22,6 +22,7 @@ from rovgraph.instruments import DEFAULT_DIP, OFFSETS, heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.streams import LAT_LON
 from rovgraph.rules import BELIEVED_SDS, CLIPPED, SURE, TRACK, remedy_of_lag
+from rovgraph.sensors.dvl import other_way_up
 
 MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
@@ -204,7 +205,7 @@ def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Lin
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
     if wrong and unlike.agreement > as_is.agreement - 0.05:
-        tail += f". It may also be mirrored: {_other_way_up(config)}"
+        tail += f". It may also be mirrored: {other_way_up(config)}"
     text = (
         f"its track fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
     )
@@ -315,15 +316,5 @@ def _inflation(left: Complexes) -> float:
 def _mirrored_text(config: Config, like: float, unlike: float) -> str:
     return (
         f"velocities fit the fixes better with y mirrored (agreement {unlike:.2f} instead of {like:.2f}): "
-        f"{_other_way_up(config)}"
-    )
-
-
-def _other_way_up(config: Config) -> str:
-    """A hint at a DVL that is mounted the other way up."""
-    roll, pitch, yaw = config.dvl.mount_rpy_deg
-    turned, z, y = (180, "up", "port") if abs(roll) < 90 else (0, "down", "starboard")
-    return (
-        f"if the DVL's z axis points {z} and y to {y}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}] "
-        "and determine its yaw again"
+        f"{other_way_up(config)}"
     )

@@ -13,7 +13,7 @@ from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.streams import integral
-from rovgraph.rules import SURE
+from rovgraph.rules import START_REMEDY, SURE
 
 FIRST = 5  # fixes, of which the median counts
 ENOUGH = 3  # fixes
@@ -41,8 +41,7 @@ def start(log: Log, config: Config) -> Iterator[Finding]:
             "fix",
             "warning",
             f"the first fixes lie {np.median(away):.1f} m from start.north_m and start.east_m, of which the vehicle "
-            f"moved at most {np.median(way):.1f} m: check the start, the fixes' origin and, of a USBL, the ship's "
-            "heading; or raise start.position_sd_m",
+            f"moved at most {np.median(way):.1f} m: {START_REMEDY}",
             "start",
         )
 
