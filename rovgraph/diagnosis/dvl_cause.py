@@ -23,12 +23,11 @@ from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array, cross, rotate, transpose
 from rovgraph.kernels import motion_row
-from rovgraph.rules import CONTRADICTED, remedy_of_lag
+from rovgraph.rules import CLIPPED, CONTRADICTED, remedy_of_lag
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
 OVER_S = 3.0  # T
 SHIFTS_S, SHIFT_SD_S = np.arange(-2.0, 2.01, 0.05), 0.1 / 3.0
-CLIPPED = 3.0  # times the median error, beyond which an error counts no more
 ENOUGH = 50  # pings
 UNTIL_THEN = "until that is mended the track is wrong"
 
