@@ -568,6 +568,12 @@ def test_two_alarms_at_a_time_are_a_contradiction_as_severe_as_the_milder(figure
         assert one.figure > one.limit
 
 
+@pytest.mark.parametrize(("one", "other"), [("mag", "dvl_heading"), ("vehicle_heading", "dvl_heading")])
+def test_every_two_compasses_may_contradict_each_other(one, other):
+    numbers = [odd(sensor, 0.0, 90.0, 9.0) for sensor in (one, other)]
+    assert f"{one}, {other}" in {alarm.sensor for alarm in find_alarms(numbers, START) if alarm.kind == "contradiction"}
+
+
 @pytest.mark.parametrize(
     "other",
     [odd("depth", 90.1, 120.0, 9.0), odd("mag", 0.0, 90.0, 9.0), odd("depth", 0.0, 90.0, 99.0, "held")],
