@@ -13,7 +13,8 @@ from math import inf, isfinite
 from typing import Literal, NamedTuple
 
 from rovgraph.config import Config
-from rovgraph.log.frozen import HOLD, SURE
+from rovgraph.log.frozen import HOLD
+from rovgraph.log.frozen import SURE as SURE
 
 Severity = Literal["advice", "doubtful", "wrong"]
 
