@@ -119,37 +119,18 @@ class Rule:
 
 
 _ROWS = (
-    Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="as a `check` event"),
+    Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="`check` event"),
     # live, by the motion of the last minutes: looks are windows
+    Rule("clock", "the same, over that with shifted stamps", 1.15, 1.15, live="`clock` event", looks=2, from_s=60.0),
     Rule(
-        "clock", "the same, over that with shifted stamps", 1.15, 1.15, live="as a `clock` event", looks=2, from_s=60.0
-    ),
-    Rule(
-        "check",
-        "findings of the check that the data are wrong, and that nothing has mended",
-        0.0,
-        rate=0.0,
-        live="as a `check` event",
-        looks=3,
-        from_s=60.0,
+        "check", "findings of wrong data that are not mended", 0.0, rate=0.0, live="`check` event", looks=3, from_s=60.0
     ),
     Rule("innovations", "mean square of the filter's innovations, in their stated sds", 4.0, 25.0, live="as too large"),
     Rule(
-        "filter alone",
-        "share of a sensor's measurements that the filter rejected and the smoother took",
-        0.05,
-        rate=1e-3,
-        from_s=20.0,
+        "filter alone", "share of a sensor's measurements that the filter alone rejected", 0.05, rate=1e-3, from_s=20.0
     ),
     # what was held wrongly for less than a minute shows little
-    Rule(
-        "held",
-        "error of a constant that is not estimated, in its sds",
-        SURE,
-        30.0,
-        live="of the smoothed dive so far",
-        from_s=60.0,
-    ),
+    Rule("held", "error of a constant that is held, in its sds", SURE, 30.0, live="smoothed dive so far", from_s=60.0),
     Rule(
         "moved", "shift of an estimated variable or a first bias, in sds of that shift", 4.0, 10.0, 1.6e-3, live="now"
     ),
@@ -159,32 +140,19 @@ _ROWS = (
     Rule("no tilt", "seconds without roll and pitch, without an IMU", 10.0, rate=0.0),
     Rule("taken out", "seconds in which a sensor was ignored, since it contradicts all others", 0.0, live="of the DVL"),
     Rule("close", "likelihood of the next best choice of what to ignore", 1e-4),
-    Rule(
-        "rejected",
-        "largest share of a sensor's measurements rejected in a minute",
-        0.05,
-        0.5,
-        live="of the last minute",
-        looks=3,
-    ),
-    Rule("too large", "mean square of normalised residuals, in the dive", 2.0, 6.0, live="of the last minute", looks=3),
+    Rule("rejected", "largest share of measurements rejected in a minute", 0.05, 0.5, live="last minute", looks=3),
+    Rule("too large", "mean square of normalised residuals, in the dive", 2.0, 6.0, live="last minute", looks=3),
     Rule(
         "too small",
-        "1 over the mean of the filter's NIS per dimension: the noise is smaller than stated",
+        "1 over the mean NIS per dimension: noise is smaller than stated",
         1.0 / 0.3,
         advice=True,
-        live="of the last minute",
+        live="last minute",
         looks=3,
     ),
     # live, innovations wander while the calibration settles
     Rule(
-        "lasting",
-        "variance of means over 5 or 20 s, 1 for white noise",
-        4.0,
-        100.0,
-        live="of the last minute",
-        looks=3,
-        from_s=60.0,
+        "lasting", "variance of means over 5 or 20 s, 1 for noise", 4.0, 100.0, live="last minute", looks=3, from_s=60.0
     ),
     # healthy simulated dives have up to 1.1, a right recorded one of a MEMS gyro at 10 Hz has 5, faults 6 and more
     Rule("imu", "the same of the IMU's own residuals, over 20 s", 6.0, 50.0),
@@ -214,11 +182,7 @@ _ROWS = (
     ),
     Rule("halves", "difference of a constant between the halves of the dive, in sds", 10.0, 30.0),
     Rule(
-        "unstated",
-        "noise, an error that lasts, or another place of the DVL, found but not used",
-        0.0,
-        live="only",
-        from_s=60.0,
+        "unstated", "noise, lasting error or other place of the DVL, found but not used", 0.0, live="only", from_s=60.0
     ),
     Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="of both alarms"),
 )
@@ -231,7 +195,7 @@ def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
         entry = f"{{estimate: true, mean: {lag:.3f}, sd: {max(0.02, 3.0 * sd):.2f}}}"
         return f"correct its clock, or state calibration.dvl_time_offset: {entry}"
     delay = f"state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + lag:.2g}}}"
-    return f"{delay}, or correct fix.lever_arm_m" if sensor == "fix" else delay  # under way the two look alike
+    return f"{delay}, or correct fix.lever_arm_m" if sensor == "fix" else delay  # under way the two are alike
 
 
 def rule_table() -> str:

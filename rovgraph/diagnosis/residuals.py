@@ -18,6 +18,7 @@ from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span,
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.geometry import Array
+from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.rules import CHANCE, RULES, USUAL_SHARE
 
 ENOUGH = 20  # measurements
@@ -295,15 +296,10 @@ def _allowed(r: SensorResiduals, used: NDArray[np.bool_], window: Array, compone
 
 def _remedy_of_lasting(sensor: str) -> str:
     """What lets a sensor's errors last, and what to do."""
-    if sensor == "mag":
-        return (
-            "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), or "
-            f"raise {sd_key(sensor)}{_CHANGING_FIELD}"
-        )
-    if sensor in ("dvl_heading", "ahrs"):
+    if sensor in HEADING_STREAMS:
         return (
             "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), "
-            f"or raise {sd_key(sensor)}"
+            f"or raise {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}"
         )
     if sensor == "fix":
         return (
