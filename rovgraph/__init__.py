@@ -36,7 +36,7 @@ Layers (imports go downwards only)
 ----------------------------------
 cli / api, extend / pages / report, export, web / studies, live / dive, interchange / diagnosis /
 estimators, simulate, evaluate, calibrate / check / graph / engine /
-instruments / log / sensors / config, trajectory / vehicle /
+instruments, rules / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / tables / dates / gauss_markov, units, gps_time, stamps /
 geometry, workers, fast_csv, spilling / errors, process, progress.
 """

@@ -6,9 +6,15 @@ from numpy.typing import ArrayLike
 from rovgraph.config import Config
 from rovgraph.sensors import DEFAULT_DIP, SENSORS, Instrument, hydrodynamics
 
-__all__ = ["DEFAULT_DIP", "HEADING_STREAMS", "Instrument", "heading_sources", "hydrodynamics", "instruments"]
+__all__ = ["DEFAULT_DIP", "HEADING_STREAMS", "OFFSETS", "Instrument", "heading_sources", "hydrodynamics", "instruments"]
 
 HEADING_STREAMS = tuple(s.name for s in SENSORS.values() if s.heading_source)  # log streams that give heading, in order
+OFFSETS = {  # heading stream -> the calibration variable of its constant error
+    "mag": "mag_offset",
+    "ahrs": "ahrs_offset",
+    "dvl_heading": "dvl_compass_offset",
+    "vehicle_heading": "vehicle_compass_offset",
+}
 
 
 def heading_sources(config: Config, available: set[str]) -> list[str]:

@@ -26,7 +26,7 @@ LAYERS = (
     {"config", "trajectory"},
     {"sensors"},
     {"log"},
-    {"instruments"},
+    {"instruments", "rules"},
     {"engine"},
     {"graph"},
     {"check"},

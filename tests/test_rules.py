@@ -31,11 +31,11 @@ from rovgraph.diagnosis import (
 )
 from rovgraph.diagnosis.alarm import Alarm, alarm_of
 from rovgraph.diagnosis.evidence import SensorResiduals
-from rovgraph.diagnosis.rules import CHANCE, rule_table
 from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.engine.released import Released
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate, History
 from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
+from rovgraph.rules import BELIEVED_SDS, CHANCE, COMPARISONS, comparison_table, remedy_of_lag, rule_table
 from rovgraph.trajectory import Trajectory
 
 ALARMS = Path(__file__).parents[1] / "docs" / "alarms.md"
@@ -159,6 +159,28 @@ def test_the_manual_has_the_table_of_the_rules():
         (row,) = [line for line in rule_table().splitlines() if line.startswith(f"| `{kind}` |")]
         assert f"{rule.doubtful:.3g}" in row
         assert f"{rule.wrong:.3g}" in row or rule.wrong == inf
+
+
+def test_the_manual_has_the_table_of_the_comparisons():
+    page = ALARMS.with_name("check.md").read_text(encoding="utf-8")
+    assert f"<!-- comparisons -->\n{comparison_table()}\n<!-- /comparisons -->" in page
+
+
+@pytest.mark.parametrize("limits", COMPARISONS, ids=lambda limits: limits.compared)
+@pytest.mark.parametrize(("times", "late"), [(BELOW, False), (ABOVE, True)])
+def test_a_lag_is_neither_chance_nor_what_is_believed(limits, times, late):
+    for mean in (0.0, -2.0):
+        for sd, believed_sd, least in ((0.0, 0.0, limits.lag_s), (1.0, 0.0, limits.sds), (0.0, 1.0, BELIEVED_SDS)):
+            for sign in (-1.0, 1.0):
+                assert limits.is_late(mean + sign * times * least, sd, (mean, believed_sd)) == late
+    assert not limits.is_late(99.0, nan, (0.0, 0.0))
+
+
+def test_late_stamps_are_mended_by_what_is_known_already_and_what_is_left():
+    config = falcon(delay_s={"fix": 0.5})
+    assert remedy_of_lag(config, "fix", 1.0, 0.1) == "state delay_s: {fix: 1.5}, or correct fix.lever_arm_m"
+    assert remedy_of_lag(config, "ahrs", 0.4, 0.1) == "state delay_s: {ahrs: 0.4}"
+    assert remedy_of_lag(config, "dvl", 0.3, 0.01).endswith("{estimate: true, mean: 0.300, sd: 0.03}")
 
 
 # residuals
@@ -544,6 +566,12 @@ def test_two_alarms_at_a_time_are_a_contradiction_as_severe_as_the_milder(figure
     for one in said:
         assert span_of(one) == (60.0, 90.0)
         assert one.figure > one.limit
+
+
+@pytest.mark.parametrize(("one", "other"), [("mag", "dvl_heading"), ("vehicle_heading", "dvl_heading")])
+def test_every_two_compasses_may_contradict_each_other(one, other):
+    numbers = [odd(sensor, 0.0, 90.0, 9.0) for sensor in (one, other)]
+    assert f"{one}, {other}" in {alarm.sensor for alarm in find_alarms(numbers, START) if alarm.kind == "contradiction"}
 
 
 @pytest.mark.parametrize(

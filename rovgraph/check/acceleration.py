@@ -15,19 +15,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import CLIPPED, without_spikes
-from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
+from rovgraph.check.findings import without_spikes
+from rovgraph.check.inertial import GAP_PERIODS, LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.check.lags import ORIENTATIONS, correlate, normal_equations, spread
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate
 from rovgraph.log import Stream
+from rovgraph.rules import ACCELERATION, CLIPPED
 
-FOLLOWS = 0.65  # agreement of accelerations that are of one motion
 BETTER = 2.0  # times smaller an error than as configured, which chance does not make
 WINDOW = 1.0  # over which velocities change, at least two pings [s]
-LARGEST_LAG = 300.0  # that is searched for [s]
 OVERLAP = 0.6  # of the dive, that a shift leaves
-LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
 ENOUGH_PINGS = 30
 BURST = 5  # pings that a serial buffer may hold back
@@ -144,9 +142,9 @@ class Comparison:
     @property
     def longest(self) -> float:
         """Between two pings that are interpolated [s]."""
-        return max(LONGEST_PING_GAP * self.period, 1.0)
+        return max(GAP_PERIODS * self.period, 1.0)
 
-    def search(self, largest: float = LARGEST_LAG, during: tuple[float, float] = ALWAYS) -> Search:
+    def search(self, largest: float = ACCELERATION.reach_s, during: tuple[float, float] = ALWAYS) -> Search:
         """Every orientation at every lag, by the IMU's samples between two times."""
         time, step = self.motion.time, self.motion.step
         known = self.known & (time >= during[0]) & (time <= during[1])

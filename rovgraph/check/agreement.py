@@ -3,23 +3,25 @@
 Each comparison takes what two sensors say of the change within windows of some seconds (`rovgraph.check.signals`).
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
-from rovgraph.check.findings import BELIEVED_SDS, Finding, integral, valid_pings, without_spikes
+from rovgraph.check.findings import Finding, believed_lag, valid_pings, without_spikes
 from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
-from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
+from rovgraph.check.signals import MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
-from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
-from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import downwards
+from rovgraph.log.streams import integral
 from rovgraph.log.units import turn_angles
+from rovgraph.rules import DESCENT, FOLLOWS, TURNING, MotionLimits, remedy_of_lag
+from rovgraph.sensors.dvl import other_way_up
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
@@ -28,8 +30,6 @@ LEAST_STEP = 0.3  # of a depth whose zero is set anew [m]
 STEPS = 10.0  # times its usual change against the DVL's way
 MOST_STEPS = 3
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
-EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
-WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
 LEAST_LEVEL = 0.1  # cos(pitch)^2 below which a heading turns at any rate
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading", "vehicle_heading": "heading"}
 ZEROS = {"enu": "east", "nwu": "north"}  # of headings that count anticlockwise
@@ -59,10 +59,9 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         yield _turning(log, config, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), heading)
-            delay = config.delay_s.get(sensor, 0.0) + found.seconds
-            remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
-            turn = f"the turning of {NAMES[sensor]}"
-            yield from _clock(sensor, turn, "the gyro's", found, EVIDENCE, remedy, _stated(config, found, sensor))
+            remedy = f"if it is late, {remedy_of_lag(config, sensor, found.seconds, found.sd)}"
+            turn, believed = f"the turning of {NAMES[sensor]}", believed_lag(config, sensor)
+            yield from _clock(sensor, turn, "the gyro's", found, TURNING, believed, remedy)
 
 
 def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -87,7 +86,7 @@ def _heading_lag(gyro: Signal, by_gyro: Signal, heading: Signal) -> Lag:
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
     """Integrated rate about the body's z axis [rad]."""
     rate_b = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])
-    return Signal(imu.time, integral(imu, rate_b[:, 2]))
+    return Signal(imu.time, integral(imu.time, rate_b[:, 2]))
 
 
 def _heading_by_gyro(log: Log, config: Config, motion: InertialMotion | None) -> Signal:
@@ -203,25 +202,15 @@ def _if_degrees(sensor: str) -> str:
     return f"if it is in degrees, state units: {{{sensor.removeprefix('vehicle_')}: deg}}"
 
 
-def _stated(config: Config, found: Lag, late: str, than: str | None = None) -> bool:
-    """Whether a lag of one sensor, than another, is what the configuration states or lets an estimate find."""
-    priors, every = beliefs(config), instruments(config)
-    own, other = (None if sensor is None else every[sensor].time_offset for sensor in (late, than))
-    known = {name: sign for name, sign in ((own, 1.0), (other, -1.0)) if name is not None}
-    offset = sum(sign * float(priors[name].mean[0]) for name, sign in known.items())
-    sd = math.hypot(*(priors[name].sd for name in known if priors[name].estimate))
-    return (offset != 0.0 or sd > 0.0) and abs(found.seconds - offset) < max(LAG_WARNING, BELIEVED_SDS * sd)
-
-
 def _clock(
-    sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str, stated: bool
+    sensor: str, what: str, against: str, found: Lag, limits: MotionLimits, believed: tuple[float, float], remedy: str
 ) -> Iterator[Finding]:
-    """A lag, if there is one that is not stated."""
+    """A lag, if there is one that is not believed."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
-    if found.significant(evidence) and not stated:
+    if limits.is_late(found.seconds, found.sd, believed) and found.evidence > limits.evidence:
         text = f"{what} comes {later}{sd}: the clocks disagree, or a filter delays it; {remedy}"
         yield Finding(sensor, "warning", text, "lag")
     else:
@@ -235,7 +224,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     pings = valid_pings(log["dvl"])
     if len(pings) < MIN_WINDOWS:
         return
-    down = _downwards(log["imu"], config, pings.time)
+    down = downwards(log["imu"], config, pings.time)
     depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
@@ -255,7 +244,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding(
             "dvl",
             "warning",
-            f"vertical velocity and the change of depth have opposite signs ({numbers}): {_flip(config)}; "
+            f"vertical velocity and the change of depth have opposite signs ({numbers}): {other_way_up(config)}; "
             "if depth counts upwards, state units: {depth: -m}",
             "sign",
         )
@@ -268,14 +257,13 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "warning", text, "scale")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
-    stated = _stated(config, behind, "dvl", than="depth")
-    against, remedy = "the change of depth", "check the clocks of both"
-    yield from _clock("dvl", "vertical velocity", against, behind, WAVE_EVIDENCE, remedy, stated)
+    against, believed = "the change of depth", believed_lag(config, "dvl", than="depth")
+    yield from _clock("dvl", "vertical velocity", against, behind, DESCENT, believed, "check the clocks of both")
 
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
     """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
-    way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
+    way = integral(pings.time, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
     depth, dvl = without_spikes(log["depth"]), Signal(pings.time, way)
     return _without_steps(Signal(depth.time, depth["depth"]), dvl, window), dvl, window
@@ -295,7 +283,7 @@ def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
     if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
         return 0.0
     pings = valid_pings(log["dvl"])
-    f = fit(*_descents(log, pings, R_bs, _downwards(log["imu"], config, pings.time)))
+    f = fit(*_descents(log, pings, R_bs, downwards(log["imu"], config, pings.time)))
     return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 
@@ -305,31 +293,3 @@ def _depth_noise(depth: Signal, config: Config, window: float) -> float:
         return config.depth.sd_m
     shown = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
     return float(max(config.depth.sd_m, shown))
-
-
-def _flip(config: Config) -> str:
-    """A hint at a DVL that is mounted the other way up."""
-    roll, pitch, yaw = config.dvl.mount_rpy_deg
-    turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
-    return f"if the DVL's z axis points {points}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}]"
-
-
-def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:
-    """Unit vector of gravity in body axes from the mean specific force around each time.
-
-    Parameters
-    ----------
-    time : ndarray, shape (m,)
-    span : averaged over so long [s]
-
-    Returns
-    -------
-    ndarray, shape (m, 3)
-    """
-    R_bs = mount_matrix(config.imu.mount_rpy_deg)
-    total = np.vstack([np.zeros(3), np.cumsum(imu.data[:, :3], axis=0)])
-    low = np.searchsorted(imu.time, time - span / 2).clip(0, len(imu) - 1)
-    high = np.maximum(np.searchsorted(imu.time, time + span / 2), low + 1)
-    f_b = rotate(R_bs, (total[high] - total[low]) / (high - low)[:, None])
-    out: Array = -f_b / np.maximum(np.linalg.norm(f_b, axis=1, keepdims=True), 1e-9)
-    return out

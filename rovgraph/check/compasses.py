@@ -16,23 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import CLIPPED, Finding
-from rovgraph.check.inertial import BIAS_SD, GAP, InertialMotion, in_gap, inertial_motion, means, smoothed
+from rovgraph.check.findings import Finding
+from rovgraph.check.inertial import BIAS_SD, GAP, GAP_PERIODS, InertialMotion, in_gap, inertial_motion, means, smoothed
 from rovgraph.check.lags import ORIENTATIONS
-from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Signal, fit
+from rovgraph.check.signals import MIN_WINDOWS, Signal, fit
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, cross, rotate, skew
-from rovgraph.instruments import heading_sources
+from rovgraph.instruments import OFFSETS, heading_sources
 from rovgraph.log import Log, Stream
+from rovgraph.rules import CLIPPED, FOLLOWS
 
 COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading themselves
-OFFSETS = {
-    "mag": "mag_offset",
-    "ahrs": "ahrs_offset",
-    "dvl_heading": "dvl_compass_offset",
-    "vehicle_heading": "vehicle_compass_offset",
-}
 FOLLOWS_GYRO = 10.0  # before and after, over which a magnetometer's heading is averaged against the gyro's [s]
 WINDOW = 2.0  # over which the field's change is compared [s]
 ENOUGH_WINDOWS = 30
@@ -150,7 +145,7 @@ def turning(
     edges = np.append(motion.time - 0.5 * motion.step, motion.time[-1] + 0.5 * motion.step)
     y, w = means(stream, values, edges), rotate(R_sb, motion.rate_b)
     period = float(np.median(np.diff(stream.time)))
-    known = motion.known & ~in_gap(motion.time, stream.time, max(GAP, 2.5 * period))
+    known = motion.known & ~in_gap(motion.time, stream.time, max(GAP, GAP_PERIODS * period))
     steps = max(1, round(max(WINDOW, 3.0 * period) / motion.step))
     count = len(y) // steps
     begin = np.arange(count) * steps

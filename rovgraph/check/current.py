@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.compasses import body_heading
-from rovgraph.check.findings import BELIEVED_SDS, SURE, Finding, since, valid_pings
+from rovgraph.check.findings import Finding, since, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.gauss_markov import walked
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log
+from rovgraph.rules import BELIEVED_SDS, SURE
 
 BLOCK_S = 20.0
 FIX_BLOCK_S = 30.0  # of fixes, whose differences are noisier

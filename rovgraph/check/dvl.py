@@ -7,21 +7,20 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Fit, Search
+from rovgraph.check.acceleration import BETTER, Comparison, Fit, Search
 from rovgraph.check.agreement import dives_with_depth
-from rovgraph.check.findings import BELIEVED_SDS, SURE, Finding
+from rovgraph.check.findings import Finding, believed_lag
 from rovgraph.check.jumps import Examined, compare, find_jump
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
+from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors.dvl import axes_remedy
 
 SIMILAR = 1.1  # times the least error, that tells two orientations apart no more
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
-LAG_WARNING = 0.05  # [s]
 APART = 0.15  # that search and fit may be apart [s]
-EVIDENCE = 30.0  # in chi-square that a lag explains
 TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
 
 
@@ -41,7 +40,7 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
         yield earth
         return
     k, m = _explanation(found)
-    if found.agreement[k, m] < FOLLOWS:
+    if found.agreement[k, m] < ACCELERATION.follows:
         yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
         return
     if k:
@@ -57,7 +56,7 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
 def _earth_axes(compared: Comparison, found: Search) -> Finding | None:
     """Whether the velocities are along Earth's axes."""
     turning, best = compared.turning(), float(found.agreement.max())
-    if turning is None or turning.not_at_all < FOLLOWS:
+    if turning is None or turning.not_at_all < ACCELERATION.follows:
         return None
     best = max(best, turning.with_vehicle)
     if 1.0 - best < BETTER * (1.0 - turning.not_at_all):
@@ -78,7 +77,7 @@ def _explanation(found: Search) -> tuple[int, int]:
     both = np.unravel_index(int(np.argmin(found.error)), found.error.shape)
     axes, lag = int(np.argmin(found.error[:, found.now])), int(np.argmin(found.error[0]))
     least = found.error[both]
-    if found.error[0, found.now] < BETTER * least or found.agreement[both] < FOLLOWS:
+    if found.error[0, found.now] < BETTER * least or found.agreement[both] < ACCELERATION.follows:
         near = np.abs(found.lags) <= 1.0  # small lags do not make errors twice as large
         return 0, int(np.flatnonzero(near)[np.argmin(found.error[0, near])])
     if found.error[0, lag] < SIMPLER * least:
@@ -97,7 +96,7 @@ def _upright(log: Log, config: Config, found: Search, m: int) -> int:
     similar = np.flatnonzero(error < SIMILAR * error.min())
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
     by_depth = [dives_with_depth(log, config, R_bs @ ORIENTATIONS[k]) for k in similar]
-    if max(by_depth) > FOLLOWS:
+    if max(by_depth) > ACCELERATION.follows:
         return int(similar[int(np.argmax(by_depth))])
     handed = np.linalg.det(ORIENTATIONS[similar]) > 0.0
     chosen = similar[handed] if handed.any() else similar
@@ -125,18 +124,15 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
 
 def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: float) -> Finding:
     """Whether the stamps are late, by the fit and by the search, whose errors are others."""
-    offset = beliefs(config)["dvl_time_offset"]
-    mean = float(offset.mean[0])
-    late = fit.lag - mean
+    believed = believed_lag(config, "dvl")
+    late = fit.lag - believed[0]
     sense = "late" if late >= 0.0 else "early"
     text = f"its stamps are {abs(late):.3f} s {sense} relative to the IMU's (sd {fit.lag_sd:.3f} s)"
-    allowed = max(LAG_WARNING, SURE * fit.lag_sd, BELIEVED_SDS * offset.sd if offset.estimate else 0.0)
-    if abs(late) < allowed:
+    if not ACCELERATION.is_late(fit.lag, fit.lag_sd, believed):
         return Finding("dvl", "ok", text)
-    if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - mean) < 0.5 * abs(late):
+    if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - believed[0]) < 0.5 * abs(late):
         return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
-    as_stamped = compared.refine(mean, H, held=True)
-    if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < EVIDENCE:
+    as_stamped = compared.refine(believed[0], H, held=True)
+    if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < ACCELERATION.evidence:
         return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
-    entry = f"{{estimate: true, mean: {fit.lag:.3f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
-    return Finding("dvl", "warning", f"{text}: correct its clock, or state calibration.dvl_time_offset: {entry}", "lag")
+    return Finding("dvl", "warning", f"{text}: {remedy_of_lag(config, 'dvl', fit.lag, fit.lag_sd)}", "lag")

@@ -8,14 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import FOLLOWS
 from rovgraph.check.agreement import heading_lag
 from rovgraph.check.jumps import compare
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config
 from rovgraph.log import Log
-
-SURE_S = 0.5  # sd of a shift that is said [s]
+from rovgraph.rules import ACCELERATION, EPOCH_SD_S
 
 
 def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -29,7 +27,7 @@ def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float]
     moved = replace(log[sensor], time=log[sensor].time - apart)
     beside = replace(log, streams={"imu": log["imu"], sensor: moved})
     lag = _dvl_lag(beside, config) if sensor == "dvl" else heading_lag(beside, config, sensor)
-    if lag is None or not lag[1] < SURE_S:
+    if lag is None or not lag[1] < EPOCH_SD_S:
         return None
     return apart + lag[0], lag[1]
 
@@ -41,7 +39,7 @@ def _dvl_lag(log: Log, config: Config) -> tuple[float, float] | None:
         return None
     found = compared.search()
     k = int(np.argmin(found.error[0]))
-    if found.agreement[0, k] < FOLLOWS:
+    if found.agreement[0, k] < ACCELERATION.follows:
         return None
     fit = compared.refine(float(found.lags[k]), ORIENTATIONS[0])
     return None if fit is None else (fit.lag, fit.lag_sd)

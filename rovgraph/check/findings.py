@@ -1,22 +1,19 @@
 """What a check has to say, and helpers that the checks share."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 import numpy as np
 
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.geometry import Array
-from rovgraph.instruments import HEADING_STREAMS, heading_sources
+from rovgraph.instruments import HEADING_STREAMS, heading_sources, instruments
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Fault, Kind, Level
 
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 CLOCKS: tuple[Kind, ...] = ("epoch", "lag", "jump")
-# limits of all checks, and of what an estimate contradicts
-SURE = 5.0  # standard deviations, from which on an error is no chance
-BELIEVED_SDS = 3.0  # of what the configuration believes to be uncertain, within which that explains an error
-CLIPPED = 4.0  # times the median residual, which counts no more
 SPIKE = 6.0  # times the usual distance from the median of five
 LEAST_SPIKE = 0.1  # [m/s, m]
 
@@ -118,6 +115,15 @@ def _without_nan(value: object) -> Any:
     return None if isinstance(value, float) and value != value else value
 
 
+def believed_lag(config: Config, late: str, than: str | None = None) -> tuple[float, float]:
+    """How much later the stamps of a sensor are believed to be than another's or the IMU's, and its sd [s]."""
+    priors, every = beliefs(config), instruments(config)
+    offsets = [(sign, every[name].time_offset) for sign, name in ((1.0, late), (-1.0, than)) if name is not None]
+    known = [(sign, priors[name]) for sign, name in offsets if name is not None]
+    sd = math.hypot(*(prior.sd for _, prior in known if prior.estimate))
+    return sum(sign * float(prior.mean[0]) for sign, prior in known), sd
+
+
 def told(stream: Stream) -> Array:
     """What a sensor measured, shape (n, k): NaN in pings without bottom lock, which hold nothing or a sentinel."""
     if stream.sensor != "dvl":
@@ -150,14 +156,3 @@ def since(log: Log, time: float) -> str:
     """
     start = min((float(s.time[0]) for s in log.streams.values()), default=0.0)
     return f"{time - start:.1f} s"
-
-
-def integral(stream: Stream, values: Array) -> Array:
-    """Trapezoidal integral of values over a stream's time from its start, same shape as values.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-    """
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(stream.time)
-    return np.concatenate([[0.0], np.cumsum(steps)])

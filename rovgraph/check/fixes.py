@@ -13,14 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.compasses import OFFSETS, body_heading
-from rovgraph.check.findings import BELIEVED_SDS, CLIPPED, SURE, Finding, valid_pings
+from rovgraph.check.compasses import body_heading
+from rovgraph.check.findings import Finding, believed_lag, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
-from rovgraph.instruments import DEFAULT_DIP, heading_sources
+from rovgraph.instruments import DEFAULT_DIP, OFFSETS, heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.streams import LAT_LON
+from rovgraph.rules import BELIEVED_SDS, CLIPPED, SURE, TRACK, remedy_of_lag
+from rovgraph.sensors.dvl import other_way_up
 
 MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
@@ -29,10 +31,7 @@ ENOUGH_DISTANCE = 10.0  # spread of the fixes [m]
 MISALIGNED = np.deg2rad(15.0)
 FARTHER = 5.0  # times the spread of fixes, that a DVL's track spreads over if they are no measurement of it
 RADIANS = 40.0, 80.0  # times too small, that radians are if they are taken for degrees
-LARGEST_LAG = 60.0  # [s]
 LAG_STEP = 0.25  # [s]
-LAG_WARNING = 0.5  # [s]
-EVIDENCE = 40.0  # in chi-square
 STRETCHED = 0.1  # logarithm of a scale that no turn leaves
 MIRRORED = 3.0  # times less error, that a mirrored axis leaves
 LIKE = 0.9  # agreement, below which fixes and track go different ways where noise is not the reason
@@ -104,7 +103,7 @@ def turned_by(log: Log, config: Config, compass: str) -> float | None:
     if found is None or found.plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
         return None
     line = found.plane.fit(found.way, 0.0)
-    return None if line.agreement < 0.6 else float(np.angle(line.c))
+    return None if line.agreement < TRACK.follows else float(np.angle(line.c))
 
 
 def _too_short(found: _Tracks, geodetic: bool) -> Finding:
@@ -113,7 +112,7 @@ def _too_short(found: _Tracks, geodetic: bool) -> Finding:
     if moved < max(ENOUGH_DISTANCE, FARTHER * found.plane.spread):
         return Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
     text = f"the fixes spread over {found.plane.spread:.2g} m while the DVL's track spreads over {moved:.3g} m"
-    if geodetic and line.agreement > 0.6 and RADIANS[0] < 1.0 / max(abs(line.c), 1e-9) < RADIANS[1]:
+    if geodetic and line.agreement > TRACK.follows and RADIANS[0] < 1.0 / max(abs(line.c), 1e-9) < RADIANS[1]:
         return Finding(
             "fix", "warning", f"{text}: latitude and longitude are in radians; state units: {{fix: rad}}", "unit"
         )
@@ -133,9 +132,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
         return
     lag, lag_sd, lag_evidence = plane.lag(way)
-    offset = beliefs(config)["fix_time_offset"]
-    allowed = max(LAG_WARNING, SURE * lag_sd, BELIEVED_SDS * offset.sd if offset.estimate else 0.0)
-    late = bool(abs(lag - offset.mean[0]) > allowed and lag_evidence > EVIDENCE)
+    late = TRACK.is_late(lag, lag_sd, believed_lag(config, "fix")) and lag_evidence > TRACK.evidence
     as_is, unlike, swapped = (plane.fit(one, 0.0) for one in (way, mirrored, way.conj()))
     late &= plane.fit(way, lag).error < min(unlike.error, swapped.error)
     if late:
@@ -149,10 +146,10 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             f"{angle:+d} deg (agreement {swapped.agreement:.2f} instead of {as_is.agreement:.2f}): {_exchange(log)}",
             "swapped",
         )
-    elif _better(unlike, as_is, MIRRORED) and unlike.agreement > 0.6 and plane.explained(unlike):
+    elif _better(unlike, as_is, MIRRORED) and unlike.agreement > TRACK.follows and plane.explained(unlike):
         yield Finding("dvl", "warning", _mirrored_text(config, as_is.agreement, unlike.agreement), "axes")
-    elif as_is.agreement < 0.6:
-        if as_is.error > EVIDENCE + 2.0 * plane.count:
+    elif as_is.agreement < TRACK.follows:
+        if as_is.error > TRACK.evidence + 2.0 * plane.count:
             text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text, "contradiction")
     else:
@@ -164,8 +161,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} relative to the DVL's track (sd {lag_sd:.1f} s)"
             moved = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1))) * abs(lag)
-            known = config.delay_s.get("fix", 0.0) + lag
-            remedy = f"state delay_s: {{fix: {known:.2g}}}, or correct fix.lever_arm_m, if it is {moved:.1f} m off"
+            remedy = f"{remedy_of_lag(config, 'fix', lag, lag_sd)}, if it is {moved:.1f} m off"
             yield Finding("fix", "warning", f"{text}: {remedy}", "lag")
 
 
@@ -179,7 +175,7 @@ def _exchange(log: Log) -> str:
 
 def _better(one: _Line, other: _Line, times: float = 1.5) -> bool:
     """Whether it explains the fixes beyond chance, and beyond what a drift of the track may do."""
-    return one.error + EVIDENCE < other.error and one.error * times < other.error
+    return one.error + TRACK.evidence < other.error and one.error * times < other.error
 
 
 def _believed(config: Config, compasses: Collection[str]) -> float:
@@ -209,7 +205,7 @@ def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Lin
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
     if wrong and unlike.agreement > as_is.agreement - 0.05:
-        tail += f". It may also be mirrored: {_other_way_up(config)}"
+        tail += f". It may also be mirrored: {other_way_up(config)}"
     text = (
         f"its track fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
     )
@@ -284,7 +280,7 @@ class _Plane:
 
     def lag(self, way: Complexes) -> tuple[float, float, float]:
         """How late the fixes are [s], its sd, and how much it explains in chi-square."""
-        reach = min(LARGEST_LAG, 0.25 * (self.time[-1] - self.time[0]))
+        reach = min(TRACK.reach_s, 0.25 * (self.time[-1] - self.time[0]))
         lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
         d = self._free(self.fixes)
         error = np.empty(len(lags))
@@ -320,15 +316,5 @@ def _inflation(left: Complexes) -> float:
 def _mirrored_text(config: Config, like: float, unlike: float) -> str:
     return (
         f"velocities fit the fixes better with y mirrored (agreement {unlike:.2f} instead of {like:.2f}): "
-        f"{_other_way_up(config)}"
-    )
-
-
-def _other_way_up(config: Config) -> str:
-    """A hint at a DVL that is mounted the other way up."""
-    roll, pitch, yaw = config.dvl.mount_rpy_deg
-    turned, z, y = (180, "up", "port") if abs(roll) < 90 else (0, "down", "starboard")
-    return (
-        f"if the DVL's z axis points {z} and y to {y}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}] "
-        "and determine its yaw again"
+        f"{other_way_up(config)}"
     )

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from rovgraph.check.findings import integral
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, skew, transpose
 from rovgraph.log import Log, Stream
+from rovgraph.log.streams import integral
 
 STEP = 0.1  # of the even times, or the IMU's period if that is longer [s]
-GAP = 0.5  # without samples that is not interpolated [s]
+GAP, GAP_PERIODS = 0.5, 2.5  # without samples that is not interpolated, the longer of the two [s]
 LEVEL_SECONDS = 25.0  # before and after, over which specific force shows the vertical
 BLOCK_SECONDS = 20.0  # over which the vertical shows the gyro's bias
 BIAS_SD = 0.1  # prior, which holds what the dive does not show [rad/s]
@@ -91,7 +91,7 @@ def inertial_motion(log: Log, config: Config) -> InertialMotion | None:
 
 def means(stream: Stream, values: Array, edges: Array) -> Array:
     """Means of a signal (n, k) between edges (m + 1,), shape (m, k)."""
-    columns = [np.interp(edges, stream.time, integral(stream, column)) for column in values.T]
+    columns = [np.interp(edges, stream.time, integral(stream.time, column)) for column in values.T]
     return np.diff(np.column_stack(columns), axis=0) / np.diff(edges)[:, None]
 
 

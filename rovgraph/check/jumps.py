@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Search
+from rovgraph.check.acceleration import BETTER, Comparison, Search
 from rovgraph.check.findings import Finding, since, valid_pings
-from rovgraph.check.inertial import inertial_motion
+from rovgraph.check.inertial import GAP, GAP_PERIODS, inertial_motion
 from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config
@@ -18,13 +18,13 @@ from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
 from rovgraph.log.beams import BEAMS
 from rovgraph.log.frozen import false_values, without
+from rovgraph.rules import ACCELERATION
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
 LARGEST_JUMP = 120.0  # [s]
 PIECE = 30.0  # shortest part of a dive that shows a lag [s]
 GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
-GAP = 0.5  # [s]
 MOST_JUMPS = 5  # of one dive, that are bridged
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
@@ -115,7 +115,7 @@ def find_jump(log: Log, compared: Comparison) -> Jump | None:
         sides = [compared.search(reach, span) for span in spans]
         best = [int(np.argmin(side.error[0])) for side in sides]
         lags = [float(side.lags[k]) for side, k in zip(sides, best, strict=True)]
-        if not all(side.agreement[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True)):
+        if not all(side.agreement[0, k] > ACCELERATION.follows for side, k in zip(sides, best, strict=True)):
             continue
         worse = [
             side.error[0, _index(side, lag)] / side.error[0, k]
@@ -191,5 +191,5 @@ def _gaps(stream: Stream) -> list[Jump]:
     periods = np.diff(stream.time)
     widest = np.argsort(periods)[-GAPS:]
     period = float(np.median(periods))
-    wide = widest[periods[widest] > max(GAP, 2.5 * period)]
+    wide = widest[periods[widest] > max(GAP, GAP_PERIODS * period)]
     return [Jump(stream.sensor, float(stream.time[k]), float(stream.time[k + 1]), period) for k in wide]

@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from rovgraph.check.inertial import in_gap
 from rovgraph.check.lags import PARTS, correlate, peak, spread
 from rovgraph.geometry import Array
+from rovgraph.rules import FOLLOWS, REACH_S
 
 MIN_WINDOWS = 15
-FOLLOWS = 0.7  # correlation of sensors that see the same motion
-LAG_WARNING = 0.3  # [s]
 LARGEST_LAG = 3.0  # that is searched for [s]
-FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
 FAR_BETTER = 4.0  # times smaller a part that two signals do not share
-SURE = 3.0  # standard deviations of a lag that is no chance
 OVERLAP = 5  # windows that begin within one
 
 
@@ -77,11 +74,6 @@ class Lag:
     sd: float
     evidence: float = 0.0
 
-    def significant(self, evidence: float) -> bool:
-        """Whether it is more than noise makes of clocks that agree, and explains so much."""
-        beyond = abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd
-        return bool(beyond and self.evidence > evidence)
-
 
 def fit(a: Signal, b: Signal, window: float) -> Fit:
     """Compare the changes of two signals."""
@@ -113,7 +105,7 @@ def coarse_lag(a: Signal, b: Signal, window: float) -> float:
     changes = [value[apart:] - value[:-apart] for value in values]
     known = [np.isfinite(change) for change in changes]
     x, y = (np.where(k, change - np.nanmean(change), 0.0) for k, change in zip(known, changes, strict=True))
-    reach = int(min(FARTHEST_LAG / step, 0.4 * len(x)))
+    reach = int(min(REACH_S / step, 0.4 * len(x)))
     left, right = (np.column_stack([k * 1.0, v, v * v]) for k, v in zip(known, (x, y), strict=True))
     both = correlate(left, right, -reach, reach)
     sums = np.array([both[0, 0], both[1, 0], both[0, 1], both[2, 0], both[0, 2], both[1, 1]]).T

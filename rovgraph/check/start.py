@@ -8,10 +8,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import SURE, Finding, valid_pings
+from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.streams import integral
+from rovgraph.rules import START_REMEDY, SURE
 
 FIRST = 5  # fixes, of which the median counts
 ENOUGH = 3  # fixes
@@ -39,8 +41,7 @@ def start(log: Log, config: Config) -> Iterator[Finding]:
             "fix",
             "warning",
             f"the first fixes lie {np.median(away):.1f} m from start.north_m and start.east_m, of which the vehicle "
-            f"moved at most {np.median(way):.1f} m: check the start, the fixes' origin and, of a USBL, the ship's "
-            "heading; or raise start.position_sd_m",
+            f"moved at most {np.median(way):.1f} m: {START_REMEDY}",
             "start",
         )
 
@@ -49,5 +50,4 @@ def _way(speed: Array, time: Array, begin: float, at: Array) -> Array:
     """Length of the way since ``begin`` [m], before the first ping at its speed."""
     when = np.unique(np.concatenate([[begin], time, at]))
     v = np.interp(when, time, speed)
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(when))])
-    return np.asarray(np.interp(at, when, way))
+    return np.asarray(np.interp(at, when, integral(when, v)))

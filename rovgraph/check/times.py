@@ -12,11 +12,11 @@ from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import FrozenStretch, Runs, repeats, without
 from rovgraph.log.streams import GAP_PERIODS
+from rovgraph.rules import SILENT_S
 from rovgraph.sensors import SENSORS
 from rovgraph.stamps import few_digits
 
 BURST = 0.3  # of the mean period, below which most periods lie within bursts
-BURST_SECONDS = 3.0  # between bursts of a buffer that is read again and again; what is longer is silence
 WITHIN = 0.1  # of the time, that bursts last at most of sensors other than the IMU, which may measure now and then only
 ENOUGH_PERIODS = 20
 BATCHED = 0.5  # share of measurements that have the stamp of another, beyond which they come in batches
@@ -147,7 +147,7 @@ def _burst_period(stream: Stream) -> float | None:
     if SENSORS[stream.sensor].occasional or np.count_nonzero(between) < ENOUGH_PERIODS:
         return None
     usual = float(np.percentile(periods[between], 90))
-    if np.median(periods) > BURST * periods.mean() or usual > BURST_SECONDS:
+    if np.median(periods) > BURST * periods.mean() or usual > SILENT_S:
         return None
     return usual if stream.sensor == "imu" or periods[~between].sum() < WITHIN * periods.sum() else None
 

@@ -1,9 +1,9 @@
 """What can be wrong with a dive: rules before, after and during it, what is found, and the verdict.
 
-Begin with `rules`, the one table of limits. `STATISTICS` are the functions: each takes the `Evidence` of a dive and
-yields figures that healthy dives keep small (docs/alarms.md). What is beyond its limit is an `Alarm`; the worst of them
-is the verdict. `unstated_noise` finds what explains a dive better than its configuration. It stands above the
-estimators, whose eliminations it asks for; `rovgraph.dive` and `rovgraph.live` use it.
+Begin with `rovgraph.rules`, the one table of limits. `STATISTICS` are the functions: each takes the `Evidence` of a
+dive and yields figures that healthy dives keep small (docs/alarms.md). What is beyond its limit is an `Alarm`; the
+worst of them is the verdict. `unstated_noise` finds what explains a dive better than its configuration. The package
+stands above the estimators, whose eliminations it asks for; `rovgraph.dive` and `rovgraph.live` use it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +12,7 @@ from rovgraph.diagnosis import constants, motion, residuals, sensors, stretches
 from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, alarm_of, verdict_of
 from rovgraph.diagnosis.dvl_cause import dvl_cause
 from rovgraph.diagnosis.evidence import Evidence
-from rovgraph.diagnosis.rules import RULES, Rule, Severity
+from rovgraph.rules import RULES, Rule, Severity
 
 __all__ = [
     "RULES",

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from rovgraph.diagnosis.rules import RULES, Severity
+from rovgraph.rules import RULES, Severity
 
 Verdict = Literal["trusted", "doubtful", "wrong"]
 

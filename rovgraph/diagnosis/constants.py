@@ -9,12 +9,12 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
-from rovgraph.diagnosis.rules import RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
+from rovgraph.rules import RULES, START_REMEDY, remedy_of_lag
 from rovgraph.units import behind, shown
 
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
@@ -89,7 +89,7 @@ def _start_moved(evidence: Evidence) -> Iterator[Statistic]:
         float(figure[worst]),
         f"the dive begins {np.linalg.norm(off):.2g} m from where it was believed to begin, {figure[worst]:.0f} sds of "
         f"what start.position_sd_m {start.position_sd_m:.2g} allows",
-        "correct start.north_m and start.east_m, or leave them to the first fix",
+        START_REMEDY,
     )
 
 
@@ -257,17 +257,10 @@ def _key_of(name: str) -> str:
 
 def _remedy_of_held(r: Released, config: Config) -> str:
     """What to do about a constant that is not what it is held at."""
-    if r.name == "dvl_time_offset":
-        return (
-            "the DVL's stamps are late (early if negative): estimate it, calibration.dvl_time_offset: {estimate: true}"
-        )
     if r.name in TIME_OFFSETS:
-        sensor, known = _sensor_of(r.name), config.delay_s.get(_sensor_of(r.name), 0.0)
-        arm = ", or correct fix.lever_arm_m" if sensor == "fix" else ""  # under way the two look alike
-        return (
-            f"stamps of {sensor} are late (early if negative): state delay_s: {{{sensor}: {known + r.step:.2g}}}, "
-            f"or estimate calibration.{r.name}{arm}"
-        )
+        sensor = _sensor_of(r.name)
+        lag = r.step + (float(beliefs(config)[r.name].mean[0]) if sensor == "dvl" else 0.0)
+        return f"stamps of {sensor} are late (early if negative): {remedy_of_lag(config, sensor, lag, r.sd)}"
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"
     if r.name == ARM:

@@ -15,22 +15,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.lags import ORIENTATIONS
-from rovgraph.config import Config, mount_matrix
+from rovgraph.config import mount_matrix
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array, cross, rotate, transpose
 from rovgraph.kernels import motion_row
-from rovgraph.log import Log
+from rovgraph.rules import CLIPPED, CONTRADICTED, remedy_of_lag
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
-SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
 OVER_S = 3.0  # T
-SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
-CLIPPED = 3.0  # times the median error, beyond which an error counts no more
+SHIFTS_S, SHIFT_SD_S = np.arange(-2.0, 2.01, 0.05), 0.1 / 3.0
 ENOUGH = 50  # pings
 UNTIL_THEN = "until that is mended the track is wrong"
 
@@ -38,7 +35,7 @@ UNTIL_THEN = "until that is mended the track is wrong"
 def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
     best, config = evidence.optimum, evidence.initial.config
-    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < SUSPICIOUS:
+    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < CONTRADICTED:
         return
     compared = _Compared.of(best, best.blocks["dvl"])
     if compared is None:
@@ -54,21 +51,16 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     else:
         late = "late" if shift > 0 else "early"
         cause = f"its stamps are about {abs(shift):.2g} s {late} relative to the IMU's"
-        entry = f"{{estimate: true, mean: {shift:.2g}, sd: 0.1}}"
-        remedy = f"correct the clock, or state calibration.dvl_time_offset: {entry}"
+        remedy = remedy_of_lag(config, "dvl", shift, SHIFT_SD_S)
         figure, kind = as_configured / shifted[shift], "clock"
     text = f"{cause}; corrected, it agrees {figure:.1f} times better with the IMU"
     found = Statistic(kind, "dvl", evidence.start, evidence.end, figure, text, remedy)
-    yield _as_checked(found, evidence.log, config) if found.severity else found
-
-
-def _as_checked(found: Statistic, log: Log, config: Config) -> Statistic:
-    """With what the check finds, where it finds something."""
-    findings = [finding for finding in dvl_and_imu(log, config) if finding.level != "ok"]
-    if not findings:
-        return found
-    kind, cause = "clock" if findings[0].of_clock else "axes", "; ".join(finding.text for finding in findings)
-    return replace(found, kind=kind, cause=cause, remedy=UNTIL_THEN)
+    of_dvl = [f for f in evidence.findings if f.wrong and (f.sensor == "dvl" or f.kind == "jump")]
+    named = [f for f in of_dvl if f.kind == "axes" or f.of_clock]
+    if found.severity and named:
+        kind, text = "clock" if named[0].of_clock else "axes", "; ".join(finding.text for finding in named)
+        found = replace(found, kind=kind, cause=text, remedy=UNTIL_THEN)
+    yield found
 
 
 class _Compared:

@@ -10,11 +10,11 @@ import numpy as np
 
 from rovgraph.calibration import MOUNT, TABLE
 from rovgraph.diagnosis.constants import FEIGNED, RELEASED
-from rovgraph.diagnosis.rules import RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
 from rovgraph.geometry import Array
+from rovgraph.rules import RULES
 
 
 @dataclass(frozen=True)

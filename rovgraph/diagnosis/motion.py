@@ -8,9 +8,9 @@ from scipy.special import chdtri
 from rovgraph.calibration import TABLE
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
-from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.rules import CHANCE, RULES, SETTLED_S
 from rovgraph.trajectory import Trajectory
 
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
@@ -18,7 +18,6 @@ IMU_S = 20.0  # over which errors of the IMU last that are no noise
 PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
 # a bias's history, columns of a motion's residual, what people call it, its unit, and how many of them make one
 BIASES = (("acc_bias", slice(9, 12), "acc", "m/s2", 1.0), ("gyr_bias", slice(12, 15), "gyr", "deg/s", np.rad2deg(1.0)))
-SETTLED_S = 10.0  # from which on the filter is asked
 COARSE = 300  # epochs at which both are compared
 LITTLE_M = 10.0  # an sd of so much may be all that a dive wants [m]
 

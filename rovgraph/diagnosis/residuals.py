@@ -15,16 +15,15 @@ from scipy.special import bdtrc, chdtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
-from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.geometry import Array
+from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.rules import CHANCE, RULES, USUAL_SHARE
 
 ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
-USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 IN_A_MINUTE = 1.5  # times as much
-SETTLED_S = 20.0  # from which on the filter is asked
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
 REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are no fault, or have a rule
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
@@ -195,7 +194,7 @@ def filter_alone(evidence: Evidence) -> Iterator[Statistic]:
         taken = evidence.residuals.get(sensor)
         if taken is None or len(taken.time) != len(met.time) or len(met.time) < ENOUGH:
             continue
-        late = met.time > evidence.start + SETTLED_S
+        late = met.time > evidence.start + RULES["filter alone"].from_s
         apart = (met.weight <= 0.0) & (taken.weight > 0.0) & late
         share = float(share_rejected(np.array([apart.sum()]), np.array([late.sum()]))[0])
         first, last = (float(t) for t in (met.time[apart][[0, -1]] if apart.any() else (evidence.start, evidence.end)))
@@ -297,15 +296,10 @@ def _allowed(r: SensorResiduals, used: NDArray[np.bool_], window: Array, compone
 
 def _remedy_of_lasting(sensor: str) -> str:
     """What lets a sensor's errors last, and what to do."""
-    if sensor == "mag":
-        return (
-            "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), or "
-            f"raise {sd_key(sensor)}{_CHANGING_FIELD}"
-        )
-    if sensor in ("dvl_heading", "ahrs"):
+    if sensor in HEADING_STREAMS:
         return (
             "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), "
-            f"or raise {sd_key(sensor)}"
+            f"or raise {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}"
         )
     if sensor == "fix":
         return (

@@ -5,10 +5,11 @@ from itertools import combinations
 
 from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.evidence import Evidence, span
-from rovgraph.diagnosis.rules import RULES, Severity
+from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.rules import RULES, Severity
 
 MEASURE_THE_SAME = (
-    ("heading", ("mag", "dvl_heading", "ahrs")),
+    ("heading", HEADING_STREAMS),
     ("vertical motion", ("dvl", "depth")),
     ("horizontal motion", ("dvl", "fix", "place", "dvl_water", "thruster")),
 )

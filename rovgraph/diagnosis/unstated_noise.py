@@ -25,11 +25,13 @@ from rovgraph.diagnosis import Alarm, Statistic
 from rovgraph.diagnosis.dvl_place import DvlPlace, other_place
 from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.gauss_newton import rejects
 from rovgraph.engine.initial_conditions import Beliefs
-from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting, rejects_much
+from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.widened_chain import lasting_belief
 from rovgraph.geometry import Array
+from rovgraph.rules import BENT
 from rovgraph.units import behind, shown
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
@@ -117,7 +119,7 @@ def _named_elsewhere(alarms: Sequence[Alarm], best: ChainOptimum) -> bool:
 
     Where much is rejected the estimate is bent, and what it holds seems to be off.
     """
-    bent = rejects_much(best.solution.gates)
+    bent = rejects(best.solution.gates, BENT)
     for alarm in alarms:
         if alarm.kind == "held":
             if alarm.sensor not in ALONE and not (bent and alarm.severity == "doubtful"):

@@ -171,6 +171,11 @@ def standing(problem: Linearizable[Point, Step], point: Point, gates: Gates, bar
     return Solution(point, gates, cost, 0, True)
 
 
+def rejects(gates: Gates, share: float) -> bool:
+    """Whether more than a share of some sensor's measurements is rejected."""
+    return any(gate.mean() < 1.0 - share for gate in gates.values() if len(gate))
+
+
 def _same(gates: Gates, others: Gates) -> bool:
     return all(np.array_equal(others[sensor], gates[sensor]) for sensor in gates)
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import Gates, Solution
+from rovgraph.engine.gauss_newton import Solution, rejects
 from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm
@@ -44,6 +44,7 @@ from rovgraph.engine.stretches import resume
 from rovgraph.engine.widened_chain import begin_at, with_lasting
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
+from rovgraph.rules import BENT
 from rovgraph.state import State
 
 if TYPE_CHECKING:
@@ -81,7 +82,6 @@ JUMP = 40.0  # of them, in chi-square
 MOST_STEPS = 3
 PART_OF_LARGEST = 0.1  # that a step has at least
 CHANCES_OF_STEP, CHANCES_OF_SIZE = 5.0, 3.0  # logs of the times at which one may be, and of the sizes of a component
-MUCH = 0.3  # of a sensor's measurements, rejected
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
@@ -136,7 +136,7 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[lis
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
         fits = [*(_fit(now, one) for one in candidates), *(_with_steps(now, one) for one in steps)]
-        fits += _reopened(now, passed) if rejects_much(now.solution.gates) else []
+        fits += _reopened(now, passed) if rejects(now.solution.gates, BENT) else []
         clear = _clearest([one for one in fits if one[0].gain >= CLEAR])
         if not clear:
             break
@@ -206,11 +206,6 @@ class _Baseline:
         for time, step in steps:
             values[self.chain.problem.time >= time] += step
         return self.reopened(wider, replace(begin, calibration={**begin.calibration, name: values}))
-
-
-def rejects_much(gates: Gates) -> bool:
-    """Whether much of a sensor is rejected: what would let it in again, residuals and gates do not show."""
-    return any(gate.mean() < 1.0 - MUCH for gate in gates.values() if len(gate))
 
 
 def _clearest(fits: list[tuple[LastingError, _Baseline]]) -> list[tuple[LastingError, _Baseline]]:

@@ -45,9 +45,8 @@ from rovgraph.engine.gauss_newton import (
 )
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.rules import CHANCE, USUAL_SHARE
 
-CHANCE = 1e-6  # that good measurements look like bad ones
-USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and as many measurements
 SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
 AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with

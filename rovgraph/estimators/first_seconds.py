@@ -15,11 +15,11 @@ from rovgraph.estimators.headings import solve_turn, trusted_first
 from rovgraph.geometry import Array, exp_rotation, rotate, wrap_angle
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import CLEAR_SPEED
 
 WINDOW_S = 5.0  # over which a log is levelled, and a sensor's first value taken
 WITHIN_S = 30.0  # from the log's start: first headings and fixes
 QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that counts as quiet [SI]
-STILL_SPEED = 0.1  # of a vehicle that stands still, by its DVL [m/s]
 STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
 HEADINGS = 50  # samples of a source that are looked at
 UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
@@ -80,7 +80,7 @@ def _moves(log: Log) -> bool:
     if "dvl" in log:
         ping = _opening(log["dvl"], log["imu"].time[0], WINDOW_S)
         speed = np.linalg.norm(ping.data[ping["dvl_valid"] == 1.0, :3], axis=1)
-        if len(speed) and np.median(speed) > STILL_SPEED:
+        if len(speed) and np.median(speed) > CLEAR_SPEED:
             return True
     for source in ("ahrs", "dvl_heading"):
         if source in log:

@@ -11,16 +11,10 @@ import numpy as np
 from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs
 from rovgraph.geometry import Array, exp_rotation, transpose, wrap_angle
-from rovgraph.instruments import Instrument
+from rovgraph.instruments import OFFSETS, Instrument
 from rovgraph.sensors import innovation
 from rovgraph.state import POSE, Jacobians, State
 
-OFFSETS = {  # heading stream -> the calibration variable of its constant error
-    "mag": "mag_offset",
-    "ahrs": "ahrs_offset",
-    "dvl_heading": "dvl_compass_offset",
-    "vehicle_heading": "vehicle_compass_offset",
-}
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
 
 

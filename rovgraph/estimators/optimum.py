@@ -6,6 +6,7 @@ import numpy as np
 
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
 from rovgraph.engine.constant_velocity import has_constant_velocity
+from rovgraph.engine.gauss_newton import rejects
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.problem import Problem
@@ -14,10 +15,8 @@ from rovgraph.engine.stretches import CLEAR, Searches
 from rovgraph.estimators.observability import shown, shown_below
 from rovgraph.estimators.without_imu import unseen
 from rovgraph.geometry import Array
+from rovgraph.rules import CONTRADICTED, RULES
 from rovgraph.state import PLACE, State
-
-MANY = 0.1  # of a sensor's measurements, rejected
-MOVED = 4.0  # prior sds from its mean, beyond which a constant is named wrongly rather than known badly
 
 
 def optimum(
@@ -60,15 +59,17 @@ def _contradicted(best: ChainOptimum) -> bool:
 
     A stretch that was taken out is an explanation of its own.
     """
-    gates = () if best.solution.stretches else best.solution.gates.values()
-    return any(gate.mean() < 1.0 - MANY for gate in gates if len(gate))
+    return not best.solution.stretches and rejects(best.solution.gates, CONTRADICTED)
 
 
 def _explains(free: ChainOptimum, best: ChainOptimum) -> bool:
-    """Whether what is considered explains, within its priors, what a dive rejects that holds it."""
+    """Whether what is considered explains, within its priors, what a dive rejects that holds it.
+
+    What is further off than that is named wrongly rather than known badly.
+    """
     beliefs = [best.beliefs[name] for name in best.unknowns.considered]
     away = [np.abs(free.state.calibration[b.variable.name] - b.mean).max() / b.sd for b in beliefs]
-    return free.solution.cost < best.solution.cost - CLEAR and max(away) < MOVED
+    return free.solution.cost < best.solution.cost - CLEAR and max(away) < RULES["moved"].doubtful
 
 
 def _with_what_is_shown(free: ChainOptimum, considered: Sequence[str], hidden: Collection[str]) -> ChainOptimum:

@@ -14,7 +14,7 @@ import numpy as np
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import Config, Mag, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.headings import OFFSETS
+from rovgraph.instruments import OFFSETS
 from rovgraph.units import behind, shown
 
 PRESETS = {"mag": "imu", "ahrs": "imu", "dvl_heading": "dvl"}  # section of the instrument that a compass is part of

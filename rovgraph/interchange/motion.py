@@ -10,12 +10,12 @@ from typing import Literal
 
 import numpy as np
 
-from rovgraph.check.findings import integral, valid_pings
+from rovgraph.check.findings import valid_pings
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
-from rovgraph.log.streams import GAP_PERIODS
+from rovgraph.log.streams import GAP_PERIODS, integral
 
 Kind = Literal["turning", "depth", "speed", "velocity", "way"]
 WINDOW = 1.0  # shortest over which changes are compared [s]
@@ -133,11 +133,11 @@ def motion_of(log: Log) -> Motion:
         signals.append(_signal("depth", "depth", log["depth"].time, log["depth"]["depth"]))
     pings = valid_pings(log["dvl"]) if "dvl" in log else None
     if pings is not None and len(pings) >= ENOUGH:
-        way = [integral(pings, column) for column in pings.data[:, :3].T]
+        way = [integral(pings.time, column) for column in pings.data[:, :3].T]
         signals.append(_signal("velocity", "dvl", pings.time, pings.data[:, :3]))
         signals.append(_signal("way", "dvl", pings.time, np.column_stack(way)))
         signals.append(_signal("depth", "dvl", pings.time, way[2]))
-        path = integral(pings, np.linalg.norm(pings.data[:, :3], axis=1))
+        path = integral(pings.time, np.linalg.norm(pings.data[:, :3], axis=1))
         signals.append(_signal("speed", "dvl", pings.time, path))
     if "fix" in log:
         fix = log["fix"]

@@ -15,13 +15,13 @@ from rovgraph.check.lags import PARTS, normal_equations, spread
 from rovgraph.geometry import Array
 from rovgraph.interchange.comparisons import Comparison, coarse_step, comparisons
 from rovgraph.interchange.motion import Motion
+from rovgraph.rules import EPOCH_SD_S
 
 LEAST_OVERLAP = 30.0  # [s]
 OVERLAP = 0.3  # of the shorter recording
 FOLLOWS = 0.3  # part of the motion's square that has to be explained
 EVIDENCE = 40.0  # in chi-square, that the best lag is better than any other
 DRIFT_SD = 1e-4  # of crystals, their prior
-SURE_S = 0.5  # sd of an offset that is believed [s]
 ITERATIONS = 20
 HELD = 3  # of them with the lag held, until mountings fit
 HOLD = 1e18  # information
@@ -89,7 +89,7 @@ def find_offset(a: Motion, b: Motion) -> Offset | None:
     others = [total for (other, total), _ in found[1:] if _differ(other, offset)]
     unrefined = float(evidence[peaks[len(rivals)]]) if len(rivals) < len(peaks) else 0.0
     second = max([unrefined * best / float(evidence[at]), *others])  # refined, it may gain as much as the best one
-    certain = offset.sd < SURE_S and best - second > max(EVIDENCE, FAR * best)
+    certain = offset.sd < EPOCH_SD_S and best - second > max(EVIDENCE, FAR * best)
     return offset if certain else None
 
 

@@ -15,7 +15,7 @@ from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_advice, find_alarms, verdict_of
 from rovgraph.diagnosis.constants import earth_rate_of, moved_constant, sds_moved
 from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
-from rovgraph.diagnosis.motion import SETTLED_S, apart
+from rovgraph.diagnosis.motion import apart
 from rovgraph.diagnosis.residuals import (
     ENOUGH,
     lasting_in,
@@ -24,7 +24,6 @@ from rovgraph.diagnosis.residuals import (
     too_large_in,
     too_small_in,
 )
-from rovgraph.diagnosis.rules import RULES
 from rovgraph.diagnosis.sensors import frozen_for
 from rovgraph.diagnosis.stretches import taken_out_in
 from rovgraph.engine.filter import FilterEngine
@@ -37,11 +36,11 @@ from rovgraph.geometry import Array
 from rovgraph.live.faults import Watch
 from rovgraph.live.reinitialisations import Adopted
 from rovgraph.live.solution import Event
+from rovgraph.rules import RULES, SETTLED_S
 from rovgraph.state import BIAS, PLACE
 
 EVERY_S = 5.0  # between looks
 LASTING_EVERY_S = 20.0  # between looks at what lasts, which cost more
-LASTING_FROM_S = 60.0  # after the start: innovations wander while the calibration settles
 ALLOWED_SDS = 2.0  # by which what is considered may be off: one constant moves all innovations
 OVER_S = 30.0  # within its limits, after which an alarm is over
 
@@ -119,7 +118,10 @@ class LiveAlarms:
         time, index = snapshot.time, snapshot.index
         if np.isnan(self._start):
             self._start = time
-            self._due, self._due_lasting = time + SETTLED_S + EVERY_S, time + LASTING_FROM_S + LASTING_EVERY_S
+            self._due, self._due_lasting = (
+                time + SETTLED_S + EVERY_S,
+                time + RULES["lasting"].from_s + LASTING_EVERY_S,
+            )
         if time < self._start + SETTLED_S:
             return
         counts = self._counts[-1]
@@ -134,7 +136,7 @@ class LiveAlarms:
                 count.nis += nis
             else:
                 count.rejected += 1
-            if count.keyframe != index and time >= self._start + LASTING_FROM_S:
+            if count.keyframe != index and time >= self._start + RULES["lasting"].from_s:
                 count.keyframe = index
                 self._samples.setdefault(sensor, []).append((met, k, count.share))
         if time >= self._due_lasting:

@@ -19,12 +19,10 @@ from rovgraph.instruments import HEADING_STREAMS, heading_sources
 from rovgraph.live.solution import Event
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.streams import joined
+from rovgraph.rules import RULES
 
 WINDOW_S = 300.0  # of motion that is compared
-FIRST_S = 60.0  # of motion, before which nothing is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
-# what `vertical` says of scales is for whole dives: in a short window slow pings of waves have another
-IN_A_ROW = {"clock": 2, "check": 3}  # windows that say so
 AGAIN_S = 1800.0  # after which what lasts is said again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
 CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
@@ -60,7 +58,7 @@ class Crosscheck:
             return []
         self._average()
         if self._next == math.inf:
-            self._next = m.time + FIRST_S
+            self._next = m.time + RULES["check"].from_s
         if m.time >= self._next:
             left = [*chain.from_iterable(self._work)]  # where the IMU was silent
             self._take_newest(m.time - WINDOW_S)
@@ -103,6 +101,7 @@ class Crosscheck:
         for check in CHECKS:
             for f in check(log, self.config):
                 contradicted |= check is dvl_and_imu and f.level != "ok"
+                # what `vertical` says of scales is for whole dives: in a short window slow pings of waves have another
                 whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
                 if f.level != "ok" and (f.of_clock or whole):
                     found.setdefault((f.sensor, f.kind if f.of_clock else check.__name__), f)
@@ -115,7 +114,7 @@ class Crosscheck:
         suspected = {key: self._suspected.get(key, 0) + 1 for key in found}
         for key, finding in found.items():
             kind = "clock" if finding.of_clock else "check"
-            if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
+            if suspected[key] >= RULES[kind].looks and now - self._said.get(key, -math.inf) > AGAIN_S:
                 self._said[key] = now
                 zero = f"; 0 s is {start:.1f} s" if finding.kind == "jump" else ""
                 events.append(Event(now, finding.sensor, kind, f"{finding.text}{zero}"))

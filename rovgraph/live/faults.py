@@ -22,8 +22,8 @@ from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
 from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_false_zero
 from rovgraph.log.log import gathered
+from rovgraph.rules import SILENT_PERIODS, SILENT_S
 
-SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
 SILENT_AT_FIRST_S = 10.0  # after a first measurement, as long as the period is not known
 SELDOM_AT_FIRST_S = {"fix": 30.0}  # of sensors that speak less often
 TELL_S = 2.0  # a ping without bottom lock is not worth an event, nor is a zero

@@ -28,13 +28,13 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.geometry import Array
+from rovgraph.rules import RULES
 from rovgraph.state import BIAS, VELOCITY
 from rovgraph.trajectory import Trajectory
 
 Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
 _Smoothed = tuple[Gaussian, list[Statistic]]
 
-EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 FREED = 20  # keyframes, after each new one, once no re-initialisation needs them: thousands at once take 40 ms
 
@@ -180,7 +180,7 @@ def _shown(
 ) -> list[Statistic]:
     """What is held wrongly, or not stated, by the smoothed dive so far."""
     begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
-    if end - begin < EXAMINED_FROM_S:
+    if end - begin < RULES["held"].from_s:
         return []
     config, variance = initial.config, np.diag(best.newest_covariance())
     v_sd = float(np.sqrt(np.median(variance[COLUMNS[VELOCITY]])))

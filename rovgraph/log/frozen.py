@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate, wrap_angle
 from rovgraph.log.log import Log
-from rovgraph.log.streams import Stream
+from rovgraph.log.streams import Stream, integral
 
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ROUNDING = 1e-9  # relative, of numbers that are converted
@@ -44,7 +44,7 @@ OUTLIES, QUIET = 8.0, 0.25  # times the distance from the mean of both neighbour
 FEWEST = 3  # that tell of a habit
 ENOUGH_VALUES = 20  # that show whether there is noise
 CHANCE = 10.0  # times as many repetitions of the last value as of the one before it are no chance
-SURE = 5.0  # standard deviations
+SURE = 5.0  # standard deviations, from which on an error is no chance
 TURN_RATE = 0.05  # sd of the rate about any axis that is no standstill [rad/s]
 FIX_DISTANCE = 10.0  # between fixes that is no standstill [m]
 DRIVE_CHANGE = 0.5  # of a thruster, as part of its sd over the log
@@ -545,7 +545,7 @@ def _turn_by_gyro(log: Log, config: Config, turning: float | None) -> Shown:
     imu = log["imu"]
     rate = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])[:, 2]
     rate = rate - (np.median(rate) if turning is None else turning)
-    turned = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(imu.time)))
+    turned = integral(imu.time, rate)
 
     def shown(run: Run) -> str:
         during = turned[_slice(imu, run.first, run.last)]
@@ -559,11 +559,8 @@ def _turn_by_gyro(log: Log, config: Config, turning: float | None) -> Shown:
 def _dive_by_dvl(pings: Stream, imu: Stream, config: Config, runs: Runs) -> Shown:
     """That the DVL, levelled, shows a descent or climb beyond what depths tell apart."""
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
-    downwards = np.sum(v_b * _down(imu, config, pings.time), axis=1)
-    step = np.minimum(np.diff(pings.time), LONGEST_STEP)
-    down, way = (
-        np.append(0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * step)) for v in (downwards, np.linalg.norm(v_b, axis=1))
-    )
+    descent = np.sum(v_b * downwards(imu, config, pings.time), axis=1)
+    down, way = (integral(pings.time, v, LONGEST_STEP) for v in (descent, np.linalg.norm(v_b, axis=1)))
     levels = np.unique(runs.values[:, 0])
     resolution = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
     least = max(DIVED, 10.0 * config.depth.sd_m, 2.0 * resolution)
@@ -597,8 +594,8 @@ def _most_dived(time: Array, down: Array, way: Array) -> float:
     return max(d if d > SLOPE * float(np.ptp(way[part])) else 0.0 for d, part in zip(dived, parts, strict=True))
 
 
-def _down(imu: Stream, config: Config, time: Array) -> Array:
-    """Downwards in body axes at some times, from the specific force around them, shape (n, 3)."""
+def downwards(imu: Stream, config: Config, time: Array) -> Array:
+    """Unit vectors downwards in body axes at some times, from the specific force around them, shape (n, 3)."""
     sums = np.vstack([np.zeros(3), np.cumsum(imu.data[:, :3], axis=0)])
     begin = np.searchsorted(imu.time, time - 0.5 * LEVEL_SECONDS)
     end = np.maximum(np.searchsorted(imu.time, time + 0.5 * LEVEL_SECONDS), begin + 1)

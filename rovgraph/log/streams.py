@@ -120,6 +120,12 @@ class Stream:
         return replace(self, time=self.time[index], data=self.data[index], row=self.row[index])
 
 
+def integral(time: Array, values: Array, longest: float = np.inf) -> Array:
+    """Trapezoidal integral of values over their times from the first on, all shape (n,); gaps count as ``longest``."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.minimum(np.diff(time), longest)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def joined(parts: Sequence[Stream]) -> Stream:
     """One stream of some of one sensor, at least one, in the order of time."""
     time, data, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "data", "row"))

@@ -42,6 +42,16 @@ def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     return f"its axes are left-handed and should be {', '.join(named)}", remedy
 
 
+def other_way_up(config: Config) -> str:
+    """A hint at a DVL that is mounted the other way up."""
+    roll, pitch, yaw = config.dvl.mount_rpy_deg
+    turned, z, y = (180, "up", "port") if abs(roll) < 90 else (0, "down", "starboard")
+    return (
+        f"if the DVL's z axis points {z} and y to {y}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}] "
+        "and determine its yaw again"
+    )
+
+
 def _rpy_deg(R_bs: Array) -> list[float]:
     """Roll, pitch and yaw as dvl.mount_rpy_deg has them."""
     return [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix(R_bs[None])[0])]
