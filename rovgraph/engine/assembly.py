@@ -46,6 +46,7 @@ from rovgraph.state import PLACE
 
 KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
 BUFFER = 64  # rows of an array to begin with
+_BETWEEN = ("motions", "covariances", "weights", "scales", "rows", "row_scales", "windows")  # what keyframes lie around
 _FATES = {
     at.EARLY: "before the first IMU sample",
     at.LATE: "after the last IMU sample",
@@ -248,6 +249,7 @@ class Assembly:
         more, scaled = rows + len(own) + len(pieces), int(self._rule.scaled)
         self._dive = dive._replace(
             motions=_grown(dive.motions, begin, n),
+            covariances=_grown(dive.covariances, begin, n),
             weights=_grown(dive.weights, begin, n),
             scales=_grown(dive.scales, begin * scaled, n * scaled),
             rows=_grown(dive.rows, rows, more),
@@ -311,6 +313,7 @@ class Assembly:
         self._dive = at.Dive(
             dive.keyframes[n:].copy(),
             dive.motions[n:].copy(),
+            dive.covariances[n:].copy(),
             dive.weights[n:].copy(),
             dive.scales[n * scaled :].copy(),
             dive.rows[rows:].copy(),
@@ -345,6 +348,7 @@ class Assembly:
             tuple(i.model.dim for i in self.instruments.values()),
             d.keyframes[:n],
             d.motions[1:n],
+            d.covariances[1:n],
             d.weights[1:n],
             d.scales[scaled : n * scaled],
             d.rows[:m],
@@ -384,7 +388,8 @@ class Assembly:
         dive.counts[[at.KEYFRAMES, at.FORGOTTEN]] = 2, known
         streams, rule = self._streams._replace(imu=table), self._rule._replace(learns=0.0)
         at.assemble(streams, self._events[:0], rule, self._integration, dive, 1)
-        return replace(self.problem, keyframes=dive.keyframes, motions=dive.motions[1:], scales=dive.scales[1:])
+        motions, covariances, scales = dive.motions[1:], dive.covariances[1:], dive.scales[1:]
+        return replace(self.problem, keyframes=dive.keyframes, motions=motions, covariances=covariances, scales=scales)
 
     # files and twins
 
@@ -398,9 +403,8 @@ class Assembly:
         if not whole:
             twin._drop(max(n - KEPT, 0))
         counts, dive = twin._dive.counts, twin._dive
-        more = {name: getattr(dive, name) for name in ("motions", "weights", "scales", "rows", "row_scales", "windows")}
         return {
-            **(more if whole else {}),
+            **({name: getattr(dive, name) for name in _BETWEEN} if whole else {}),
             "imu": twin._table,
             "events": twin._events[: twin._come],
             "order": twin._order[: counts[at.ORDERED]],
@@ -434,7 +438,7 @@ class Assembly:
         self._dive = self._room(n, m, int(counts[at.WINDOWS]))._replace(counts=counts)
         self._dive.keyframes[:], self._dive.names[:] = state["keyframes"], state["names"]
         self._dive.rows[:, 0] = state["times"]
-        for name in ("motions", "weights", "scales", "rows", "row_scales", "windows") if "motions" in state else ():
+        for name in _BETWEEN if "motions" in state else ():
             here, there = getattr(self._dive, name), state[name]
             part = tuple(slice(min(sizes)) for sizes in zip(here.shape, there.shape, strict=True))
             here[part] = there[part]
@@ -503,6 +507,7 @@ class Assembly:
         return at.Dive(
             np.zeros((keyframes, at.KEYFRAME)),
             np.zeros((keyframes, motion_row.ROW)),
+            np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes * scaled, 6, 6)),
             np.zeros((rows, Z + 2 * self._most)),
