@@ -46,7 +46,7 @@ from rovgraph.state import PLACE
 
 KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
 BUFFER = 64  # rows of an array to begin with
-_BETWEEN = ("motions", "covariances", "weights", "scales", "rows", "row_scales", "windows")  # what keyframes lie around
+_BETWEEN = ("motions", "covariances", "weights", "scales", "rows", "row_scales", "windows")  # the keyframes
 _FATES = {
     at.EARLY: "before the first IMU sample",
     at.LATE: "after the last IMU sample",

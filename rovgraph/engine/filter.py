@@ -199,14 +199,16 @@ class FilterEngine:
         before : the keyframe before them, without places
         gates : renewed in place
         """
+        assert len(problem.covariances) == len(problem.motions)  # kernels do not check where they read
         known, since = _state(before), self._since(gates)
         own = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
         taken, first = problem.taken[begin:end] - own.start, problem.first[begin:end] - own.start
         k, m, C, size = end - begin, own.stop - own.start, len(before.c), self.layout.size
         shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
-        of_motions = (a[begin - 1 : end - 1] for a in (problem.motions, problem.covariances, problem.scales))
-        intervals = Intervals(*of_motions, np.append(0, taken), first, POORLY_KNOWN)
+        some = slice(begin - 1, end - 1)
+        motions, covariances, scales = problem.motions[some], problem.covariances[some], problem.scales[some]
+        intervals = Intervals(motions, covariances, scales, np.append(0, taken), first, POORLY_KNOWN)
         measured = problem.measured(own)
         done = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)

@@ -42,6 +42,9 @@ class States(NamedTuple):
     c: Matrix = np.zeros((1, 0))
 
 
+# these give arrays away, so they are no `view_helper`, and none may call them: it writes ``Epoch(...)`` itself
+
+
 @helper
 def epoch(states: States, k: int) -> Epoch:
     """One of some states."""
