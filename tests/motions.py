@@ -12,39 +12,42 @@ from rovgraph.engine.scale import biased
 from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import measurement_row, motion_row
-from rovgraph.kernels.linearization import States, place_measurements
+from rovgraph.kernels.linearization import place_measurements
 from rovgraph.kernels.motion import transitions
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights
+from rovgraph.kernels.states import States
 from rovgraph.state import State
 
 
 def predict(motion: Array, before: State, scale: Array | None = None) -> State:
     """The state at the end of a motion, shape (ROW,); ``scale``, shape (6, 6), is that of `rovgraph.engine.scale`."""
-    return transition(motion, before, scale)[0]
+    return transition(motion, np.zeros((15, 15)), before, scale)[0]
 
 
-def transition(motion: Array, before: State, scale: Array | None = None) -> tuple[State, Array, Array]:
-    """The same with the transition F and process noise Q, shape (15, 15)."""
-    R, p, v, F, Q = (np.empty((1, *shape)) for shape in ((3, 3), (3,), (3,), (15, 15), (15, 15)))
-    transitions(motion[None], *_arrays(before, scale), R, p, v, F, Q)
+def transition(
+    motion: Array, covariance: Array, before: State, scale: Array | None = None
+) -> tuple[State, Array, Array]:
+    """The same with the transition F and process noise Q, shape (15, 15), of a residual of that covariance."""
+    R, p, v, b, F, Q = (np.empty((1, *shape)) for shape in ((3, 3), (3,), (3,), (6,), (15, 15), (15, 15)))
+    transitions(motion[None], covariance[None], _states(before, scale), States(R, p, v, b), F, Q)
     return replace(before, R_nb=R, p_n=p, v_n=v), F[0], Q[0]
 
 
 def residual(motion: Array, before: State, after: State) -> tuple[Array, Array, Array]:
     """How two states disagree with a motion, shape (15,), and the derivatives by both, shape (15, 15)."""
     r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
-    motion_errors(motion[None], *_arrays(before), *_arrays(after), r, A_i, A_j)
+    motion_errors(motion[None], _states(before), _states(after), r, A_i, A_j)
     return r[0], A_i[0], A_j[0]
 
 
-def weights(motions: Array) -> Array:
-    """Square-root information of motions, shape (n, 15, 15)."""
+def weights(motions: Array, covariances: Array) -> Array:
+    """Square-root information of motions, shape (n, 15, 15), as the covariances of their residuals."""
     W = np.empty((len(motions), 15, 15))
-    motion_weights(motions, W)
+    motion_weights(motions, covariances, W)
     return W
 
 
-def problem_of(time: Array, motions: Array) -> Problem:
+def problem_of(time: Array, motions: Array, covariances: Array) -> Problem:
     """Keyframes at n times and the motions between them, shape (n - 1, ROW), without samples and measurements."""
     keyframes = np.zeros((len(time), at.KEYFRAME))
     keyframes[:, at.TIME] = time
@@ -53,7 +56,8 @@ def problem_of(time: Array, motions: Array) -> Problem:
         dims=(),
         keyframes=keyframes,
         motions=motions,
-        weights=weights(motions),
+        covariances=covariances,
+        weights=weights(motions, covariances),
         scales=np.empty((0, 6, 6)),
         rows=np.empty((0, measurement_row.ROW)),
         row_scales=np.empty((0, 6, 6)),
@@ -66,11 +70,10 @@ def problem_of(time: Array, motions: Array) -> Problem:
     )
 
 
-def _arrays(state: State, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
-    """Attitude, position, velocity, and the bias that is seen, of one epoch, as kernels take them."""
+def _states(state: State, scale: Array | None = None) -> States:
+    """Of one epoch, with the bias that is seen, as kernels take it."""
     seen = state if scale is None else biased(state, scale[None])
-    R, p, v, bias = (np.ascontiguousarray(a, float) for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
-    return R, p, v, bias
+    return States(*(np.ascontiguousarray(a, float) for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias)))
 
 
 class Delta(NamedTuple):

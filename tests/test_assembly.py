@@ -110,6 +110,16 @@ def test_a_keyframe_stands_at_every_ping_and_at_both_ends_of_the_imu():
     assert problem.motions[:, DURATION].sum() == pytest.approx(2.0)
 
 
+def test_a_motion_has_its_covariance_until_that_is_dropped_which_copies_nothing():
+    problem, _ = assembled(log_of(2.0, [0.213, 0.4, 0.951, 1.7777]))
+    for covariance, W in zip(problem.covariances, problem.weights, strict=True):
+        np.testing.assert_allclose(W @ covariance @ W.T, np.eye(15), atol=1e-6)
+    part, bare = problem.part(1, 4, 0, 0), problem.without_covariances()
+    np.testing.assert_array_equal(part.covariances, problem.covariances[1:3])
+    assert bare.covariances.shape == (0, 15, 15) and bare.part(1, 4, 0, 0).covariances.shape == (0, 15, 15)
+    assert bare.motions is problem.motions and bare.weights is problem.weights
+
+
 def test_a_ping_is_attached_to_its_own_keyframe_without_motion():
     problem, _ = assembled(log_of(2.0, [0.213, 0.951]))
     for a in found(problem, "dvl"):
@@ -418,7 +428,9 @@ def test_what_is_forgotten_changes_nothing_of_what_follows(dive):
     assert gone > 200 and len(some) == len(whole) - gone
     a, b = whole.problem, some.problem
     np.testing.assert_array_equal(a.keyframes[gone:, at.TIME], b.keyframes[:, at.TIME])
-    np.testing.assert_allclose(a.motions[gone:], b.motions[1:] if len(b.motions) > len(a.motions) - gone else b.motions)
+    first = len(b.motions) - (len(a.motions) - gone)
+    np.testing.assert_allclose(a.motions[gone:], b.motions[first:])
+    np.testing.assert_allclose(a.covariances[gone:], b.covariances[first:])
     rows = len(a.rows) - len(b.rows)
     np.testing.assert_allclose(a.rows[rows:], b.rows)
     assert whole.left_out == some.left_out
@@ -439,6 +451,7 @@ def test_restored_from_its_state_an_assembly_goes_on_as_if_nothing_had_happened(
     first = len(before) - 3 - 40
     same(before.problem.keyframes[first:, :12], after.problem.keyframes[first:, :12])
     same(before.problem.motions[-40:], after.problem.motions[-40:])
+    same(before.problem.covariances[-40:], after.problem.covariances[-40:])
     same(before.problem.rows[-100:], after.problem.rows[-100:])
 
 

@@ -18,6 +18,7 @@ from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_S
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 SECONDS = 0.9
+NONE = np.full((15, 15), np.nan)  # covariance of samples that count for nothing
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +36,13 @@ def silent(gap_s: float) -> Problem:
     params = preintegration_params(falcon())
     params = replace(params, densities=(BRIDGE_ACC, BRIDGE_GYR, *params.densities[2:]))
     samples = np.array([[t, 0.3, 0.1, -9.8, 0.02, -0.05, 0.3] for t in (-0.1, SECONDS + 0.1)])
-    motion, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS, gap_s)
-    return problem_of(np.array([0.0, SECONDS]), motion[None])
+    motion, covariance, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS, gap_s)
+    return problem_of(np.array([0.0, SECONDS]), motion[None], covariance[None])
 
 
 def covariance(motion: Array) -> Array:
     """Of the residual."""
-    [W] = weights(motion[None])
+    [W] = weights(motion[None], NONE[None])
     return np.linalg.inv(W.T @ W)
 
 
@@ -97,7 +98,7 @@ def test_the_factor_is_the_residual_whitened(dive, motion):
 
 
 def test_filters_have_it_from_the_same_derivatives(motion):
-    after, F, Q = transition(motion, BEFORE)
+    after, F, Q = transition(motion, NONE, BEFORE)
     (_, A_i, A_j), S = residual(motion, BEFORE, after), covariance(motion)
     np.testing.assert_allclose(A_j @ F, -A_i, atol=1e-9)
     np.testing.assert_allclose(A_j @ Q @ A_j.T, S, atol=1e-12)
@@ -108,7 +109,7 @@ def test_a_tilt_that_is_as_vague_as_a_vehicles_stays_so(motion):
     known = state([0.0, 0.0, 1.0], [0, 0, 5], [0, 0, 0])
     P = np.zeros((15, 15))
     for _ in range(10):
-        _, F, Q = transition(motion, known)
+        _, F, Q = transition(motion, NONE, known)
         P = F @ P @ F.T + Q
     np.testing.assert_allclose(np.sqrt(np.diag(P)[:2]), TILT_SD, rtol=1e-3)
     assert np.sqrt(P[2, 2]) == pytest.approx(BRIDGE_GYR * np.sqrt(10 * SECONDS), rel=1e-3)

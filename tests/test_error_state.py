@@ -113,8 +113,10 @@ def moving(seconds: float, rate: float = 100.0) -> tuple[State, Array]:
     return State(attitude, np.array([[3.0, -2.0, 5.0]]), np.array([[0.4, -0.2, 0.1]]), bias), np.column_stack([t, f, w])
 
 
-def motion_of(samples: Array, seconds: float, bias: Array, config: Config) -> Array:
-    return preintegrate(preintegration_params(config), bias, samples, 0.0, np.empty(0), seconds)[0]
+def motion_of(samples: Array, seconds: float, bias: Array, config: Config) -> tuple[Array, Array]:
+    """The motion, and the covariance of its residual."""
+    motion, covariance, _ = preintegrate(preintegration_params(config), bias, samples, 0.0, np.empty(0), seconds)
+    return motion, covariance
 
 
 def difference(state: State, other: State) -> Array:
@@ -127,8 +129,8 @@ def difference(state: State, other: State) -> Array:
 
 def test_transition_is_the_derivative_of_the_prediction():
     state, samples = moving(0.5)
-    motion = motion_of(samples, 0.5, np.zeros(6), falcon())
-    after, F, _ = transition(motion, state)
+    motion, covariance = motion_of(samples, 0.5, np.zeros(6), falcon())
+    after, F, _ = transition(motion, covariance, state)
     step, columns = 1e-5, []
     for variable, size in DIMENSION.items():
         for k in range(size):
@@ -144,7 +146,7 @@ def test_process_noise_is_that_of_noisy_samples():
     noise = config.imu.noise
     state, samples = moving(seconds)
     state = replace(state, bias=np.zeros((1, 6)))
-    exact, _, Q = transition(motion_of(samples, seconds, np.zeros(6), config), state)
+    exact, _, Q = transition(*motion_of(samples, seconds, np.zeros(6), config), state)
     densities = np.repeat([noise.acc, noise.gyr], 3)
     walks = np.repeat([noise.acc_walk, noise.gyr_walk], 3)
     errors = []
@@ -152,7 +154,7 @@ def test_process_noise_is_that_of_noisy_samples():
         drift = np.cumsum(walks / np.sqrt(rate) * rng.standard_normal((len(samples), 6)), axis=0)
         noisy = samples.copy()
         noisy[:, 1:] += drift + densities * np.sqrt(rate) * rng.standard_normal((len(samples), 6))
-        predicted = predict(motion_of(noisy, seconds, np.zeros(6), config), state)
+        predicted = predict(motion_of(noisy, seconds, np.zeros(6), config)[0], state)
         integration = INTEGRATION_SD * np.sqrt(seconds) * rng.standard_normal((1, 3))
         truth = replace(exact, p_n=exact.p_n + integration, bias=drift[[int(seconds * rate)]])
         errors.append(difference(predicted, truth))
@@ -277,7 +279,7 @@ def test_an_error_that_lasts_keeps_its_stationary_variance_and_what_walks_gains_
     known = FilterState(x, c, P, np.zeros((n, 0)), nothing)
     layout = Coordinates(np.arange(n), np.zeros((0, 3), np.int64), nothing, np.zeros(0, np.int64))
     model = FilterModel(np.zeros((0, measurement_row.PARAMS)), column, layout, walks, 0.0)
-    predict_filter(known, motion, nothing, model, P.copy(), P.copy())
+    predict_filter(known, motion, np.zeros((MOTION, MOTION)), nothing, model, P.copy(), P.copy())
     np.testing.assert_allclose(np.diag(P)[MOTION:], [sd**2, sd**2, 0.5**2 + walk**2 * seconds])
     np.testing.assert_allclose(c[LAYOUT["fix_error"]], np.exp(-seconds / 30.0))
 

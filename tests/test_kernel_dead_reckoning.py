@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from rovgraph.geometry import earth_rate_n, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, transpose
-from rovgraph.kernels.dead_reckoning import reckon_attitude
+from rovgraph.kernels.dead_reckoning import Aiding, Motions, Start, Surroundings, reckon_attitude
 
 G, DT = 9.81, 0.2
 DENSITY = np.array([0.05**2, 1e-3**2, 1e-5**2])
@@ -34,14 +34,13 @@ def reckoned(
         "compass": np.tile([0.0, math.inf, 0.0], (n, 1)),
         "reference": np.tile(np.eye(3), (n, 1, 1)),
     } | rows
-    numbers = np.array([G, 2.0, held, SD[1, 0] ** 2, *w_ie_n, *np.zeros(3)])
+    around = Surroundings(G, 2.0, held, SD[1, 0] ** 2, np.array(w_ie_n, float), np.zeros(3))
     R, b = np.empty((n, 3, 3)), np.empty((n, 3))
     start = R_nb if start is None else start
     P = np.array([np.diag(sd**2) for sd in SD])
-    reckon_attitude(
-        tables["outage"], dt, dR, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)), tables["dvl"], tables["compass"],
-        tables["reference"], np.ascontiguousarray(start), np.zeros(3), P, numbers, R, b,
-    )  # fmt: skip
+    motions = Motions(tables["outage"], dt, dR, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)))
+    aiding = Aiding(tables["dvl"], tables["compass"], tables["reference"])
+    reckon_attitude(motions, aiding, Start(np.ascontiguousarray(start), np.zeros(3), P), around, R, b)
     return R, b, true
 
 
@@ -81,13 +80,12 @@ def test_the_velocity_of_pings_is_told_from_tilt():
         R, b = np.empty((n, 3, 3)), np.empty((n, 3))
         dt = np.append(0.0, np.full(n - 1, DT))
         dv = dt[:, None] * np.array([gained, 0.0, -G])
-        numbers = np.array([G, 2.0, 1.0, 0.0, *np.zeros(6)])
+        around = Surroundings(G, 2.0, 1.0, 0.0, np.zeros(3), np.zeros(3))
         nothing, same = np.tile([0.0, math.inf, 0.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
         P = np.array([np.diag(sd**2) for sd in SD])
-        reckon_attitude(
-            np.zeros(n, bool), dt, same, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)), dvl, nothing, same,
-            np.eye(3), np.zeros(3), P, numbers, R, b,
-        )  # fmt: skip
+        motions = Motions(np.zeros(n, bool), dt, same, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)))
+        start = Start(np.eye(3), np.zeros(3), P)
+        reckon_attitude(motions, Aiding(dvl, nothing, same), start, around, R, b)
         return float(np.abs(rpy_from_matrix(R)[:, 1]).max())
 
     assert tilt(acceleration) < 1e-9

@@ -11,6 +11,7 @@ from rovgraph.engine.filter_step import states_of
 from rovgraph.geometry import Array, exp_rotation
 from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.error_coordinates import ErrorLayout, Scratch, local, make_scratch, retract
+from rovgraph.kernels.states import Epoch
 from rovgraph.sensors import CompiledModel, innovation
 from rovgraph.state import VELOCITY, State
 
@@ -46,18 +47,18 @@ def seen(layout, instruments) -> dict[str, CompiledModel]:
     return {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in layout.columns}
 
 
-def states(layout: Layout, seed: int) -> list[list[Array]]:
-    """R, p, v, b, c of any states; what is not estimated is the same of all of them."""
+def states(layout: Layout, seed: int) -> list[Epoch]:
+    """Any states; what is not estimated is the same of all of them."""
     state, fixed = random_state(seed, N, per_epoch=True), random_state(0).calibration
     own = {name: value if name in layout.columns else fixed[name] for name, value in state.calibration.items()}
     return [one(State(state.R_nb, state.p_n, state.v_n, state.bias, own), k) for k in range(N)]
 
 
-def one(state: State, k: int) -> list[Array]:
+def one(state: State, k: int) -> Epoch:
     c = np.zeros(SIZE)
     for name, own in LAYOUT.items():
         c[own] = state.calibration[name][k] if state.calibration[name].ndim == 2 else state.calibration[name]
-    return [state.R_nb[k].copy(), state.p_n[k].copy(), state.v_n[k].copy(), state.bias[k].copy(), c]
+    return Epoch(state.R_nb[k].copy(), state.p_n[k].copy(), state.v_n[k].copy(), state.bias[k].copy(), c)
 
 
 def prepared(layout: Layout) -> tuple[ErrorLayout, Scratch, Array]:
@@ -65,13 +66,13 @@ def prepared(layout: Layout) -> tuple[ErrorLayout, Scratch, Array]:
     return own, make_scratch(len(own.seen), SIZE), np.eye(layout.size)
 
 
-def moved_by(layout: Layout, size: float = 1.0) -> list[tuple[list[Array], Array, list[Array], Array]]:
+def moved_by(layout: Layout, size: float = 1.0) -> list[tuple[Epoch, Array, Epoch, Array]]:
     """Each state, an error, where it leads, and the change of basis."""
     own, scratch, basis = prepared(layout)
     out = []
     for before, delta in zip(states(layout, 1), size * errors(layout), strict=True):
-        after = [a.copy() for a in before]
-        retract(*after, delta, own, scratch, basis)
+        after = Epoch(*(a.copy() for a in before))
+        retract(after, delta, own, scratch, basis)
         out.append((before, delta, after, basis.copy()))
     return out
 
@@ -80,7 +81,7 @@ def errors(layout: Layout) -> Array:
     return 0.3 * np.random.default_rng(2).standard_normal((N, layout.size))
 
 
-def prediction(model: CompiledModel, layout: Layout, epoch: list[Array]) -> tuple[Array, Array]:
+def prediction(model: CompiledModel, layout: Layout, epoch: Epoch) -> tuple[Array, Array]:
     """Measurement, shape (1, dim), and its derivative by the error, shape (dim, size)."""
     R, p, v, b, c = epoch
     state = states_of(np.concatenate([R.ravel(), p, v, b])[None], c)
@@ -112,7 +113,7 @@ def test_a_change_of_basis_keeps_attitude_and_position_in_n_and_what_each_instru
     own_rows = {row for name in seen for row in np.r_[layout.columns[name]].tolist()}
     rest, delta = [k for k in range(6, layout.size) if k not in own_rows], np.empty(layout.size)
     for before, other in zip(states(layout, 1), states(layout, 3), strict=True):
-        local(*before, tuple(other), own, scratch, delta, basis)  # takes errors about the other to this one
+        local(before, other, own, scratch, delta, basis)  # takes errors about the other to this one
         turn = np.zeros((3, layout.size))
         turn[:, :3] = before[0].T @ other[0]
         np.testing.assert_allclose(basis[:3], turn, atol=1e-12)
@@ -127,7 +128,7 @@ def test_difference_undoes_the_retraction(layout):
     own, scratch, basis = prepared(layout)
     found = np.empty(layout.size)
     for before, delta, after, _ in moved_by(layout):
-        local(*before, tuple(after), own, scratch, found, basis)
+        local(before, after, own, scratch, found, basis)
         np.testing.assert_allclose(found, delta, atol=1e-10)
 
 
@@ -137,7 +138,7 @@ def test_the_basis_of_a_retraction_is_that_of_the_difference_back_but_for_the_se
     for size in (1.0, 0.1):
         off.append(0.0)
         for before, _, after, there in moved_by(layout, size):
-            local(*after, tuple(before), own, scratch, found, basis)
+            local(after, before, own, scratch, found, basis)
             off[-1] = max(off[-1], np.abs(basis - there).max())
     assert off[1] <= 0.02 * off[0] + 1e-12
 

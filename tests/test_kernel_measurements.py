@@ -14,7 +14,8 @@ from rovgraph.calibration import LAYOUT, SIZE, TABLE, Variable, calibration_size
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, wrap_angle
 from rovgraph.kernels import layout
 from rovgraph.kernels import measurements as kernels
-from rovgraph.kernels.propagation import WORK, chain, propagate, propagation_jacobian
+from rovgraph.kernels.propagation import WORK, Snapshot, chain, propagate, propagation_jacobian
+from rovgraph.kernels.states import Epoch, States
 from rovgraph.kernels.weighting import LOSSES, loss_weight, robust_cost, weight_many, whiten_many
 from rovgraph.sensors import CompassHeading, Position
 from rovgraph.state import PLACE_DIM, State
@@ -56,7 +57,7 @@ def predict(name: str, given: list[np.ndarray], columns=None) -> tuple[np.ndarra
     (kind, dim, params), n = CASES[name], len(given[1])
     columns = np.arange(layout.MOTION + given[4].shape[1]) if columns is None else np.array(columns)
     z, H = np.full((n, dim), np.nan), np.full((n, dim, len(columns)), np.nan)
-    kernels.predict_many(kind, *given, np.array([params], float), columns, z, H)
+    kernels.predict_many(kind, States(*given[:5]), given[5], np.array([params], float), columns, z, H)
     return z, H
 
 
@@ -88,7 +89,8 @@ def test_one_epoch_is_predicted_as_many(name):
     work = np.empty((kernels.WORK, 3, 3))
     for k in range(N):
         one_z, one_H = np.empty(dim), np.zeros(H.shape[1:])
-        kernels.predict(kind, *(values[k] for values in given), np.array(params, float), one_z, one_H, work)
+        *state, rate = (values[k] for values in given)
+        kernels.predict(kind, Epoch(*state), rate, np.array(params, float), one_z, one_H, work)
         np.testing.assert_allclose(one_z, z[k], rtol=0, atol=1e-15)
         np.testing.assert_allclose(one_H, H[k], rtol=0, atol=1e-15)
 
@@ -99,7 +101,8 @@ def test_a_buffer_of_jacobians_that_was_used_before_serves_again(name):
     H = predict(name, given)[1]
     z, buffer, work = np.empty(dim), np.zeros(H.shape[1:]), np.empty((kernels.WORK, 3, 3))
     for k in range(N):
-        kernels.predict(kind, *(values[k] for values in given), np.array(params, float), z, buffer, work)
+        *state, rate = (values[k] for values in given)
+        kernels.predict(kind, Epoch(*state), rate, np.array(params, float), z, buffer, work)
         np.testing.assert_allclose(buffer, H[k], rtol=0, atol=1e-15)
 
 
@@ -120,15 +123,18 @@ def test_one_row_stands_for_all_epochs(name):
         np.testing.assert_array_equal(again_H, H)
 
 
-def test_inputs_may_be_strided_and_read_only():
-    given = epochs("dvl")
-    backwards = [values[::-1].copy()[::-1] if k != 4 else values for k, values in enumerate(given)]
-    backwards[0] = np.broadcast_to(backwards[0][0], (N, 3, 3))
-    for values in backwards[:4]:
+def test_states_that_a_model_is_given_may_be_strided_and_read_only():
+    R, p, v, b, _, rate = epochs("depth")
+    model, known = Position("depth", np.array(ARM), (2,), "depth_offset"), {"depth_offset": np.full((N, 1), 0.3)}
+    backwards = [values[::-1].copy()[::-1] for values in (R, p, v, b, rate)]
+    backwards[0] = np.broadcast_to(R[0], (N, 3, 3))
+    for values in backwards:
         values.flags.writeable = False
-    expected = predict("dvl", [np.repeat(given[0][:1], N, axis=0), *given[1:]])
-    for mine, theirs in zip(predict("dvl", backwards), expected, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    z, H = model.predict(State(*backwards[:4], known), backwards[4])
+    expected, J = model.predict(State(np.repeat(R[:1], N, axis=0), p, v, b, known), rate)
+    np.testing.assert_array_equal(z, expected)
+    for name in J:
+        np.testing.assert_array_equal(H[name], J[name])
 
 
 def test_kernels_have_the_layout_of_the_table():
@@ -202,10 +208,11 @@ def motions() -> tuple[list[np.ndarray], list[np.ndarray]]:
 def test_one_epoch_is_propagated_as_many():
     state, motion = motions()
     there, F = propagate_all(State(*state), Delta(*motion), 9.81)
-    out = there.R_nb, there.p_n, there.v_n
+    out, nothing = (there.R_nb, there.p_n, there.v_n), np.empty(0)
     work, one, one_F = np.empty((WORK, 3, 3)), [np.empty((3, 3)), np.empty(3), np.empty(3)], np.zeros((15, 15))
     for k in range(N):
-        propagate(*(values[k] for values in (*state, *motion)), 9.81, *one, work)
+        before, moved = Epoch(*(values[k] for values in state), nothing), Snapshot(*(values[k] for values in motion))
+        propagate(before, moved, 9.81, Epoch(*one, before.b, nothing), work)
         propagation_jacobian(state[0][k], motion[0][k], one_F, work)  # of an F before it, from the second on
         for mine, theirs in zip((*one, one_F), (*out, F), strict=True):
             np.testing.assert_allclose(mine, theirs[k], rtol=0, atol=1e-15)

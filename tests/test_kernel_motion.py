@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -24,7 +25,6 @@ from rovgraph.kernels.motion_residual import (
 from rovgraph.kernels.motion_row import (
     BIAS,
     BY_BIAS,
-    COVARIANCE,
     DURATION,
     EARTH_RATE,
     GAP,
@@ -35,9 +35,17 @@ from rovgraph.kernels.motion_row import (
     TANGENT,
 )
 from rovgraph.kernels.preintegration import SNAPSHOT, integrated_steps, preintegrate
+from rovgraph.kernels.states import States
 
 DENSITIES = np.array([8e-4, 7e-4, 1.6e-3, 8.7e-5, 1e-3])
 STILL, EARTH, SPUN = np.zeros(3), np.array([3.8e-5, 0.0, -6.2e-5]), np.array([0.3, -0.2, 0.4])
+
+
+class Motion(NamedTuple):
+    """A row and its covariance."""
+
+    row: Array
+    covariance: Array
 
 
 @dataclass
@@ -52,13 +60,15 @@ class Case:
     densities: Array
     earth_rate: Array
 
-    def row(self, gap: float = 0.0) -> tuple[Array, Array]:
+    def integrated(self, gap: float = 0.0) -> tuple["Motion", Array]:
+        """The motion, and snapshots of it."""
         row, snapshots = np.full(ROW, np.nan), np.full((len(self.stops), SNAPSHOT), np.nan)
+        covariance = np.full((15, 15), np.nan)
         row[GAP], row[GRAVITY] = gap, 9.81
         row[BIAS : BIAS + 6], row[NOISE : NOISE + 5] = self.bias, self.densities
         row[EARTH_RATE : EARTH_RATE + 3] = self.earth_rate
-        preintegrate(self.imu, self.start, self.end, self.stops, row, snapshots)
-        return row, snapshots
+        preintegrate(self.imu, self.start, self.end, self.stops, row, covariance, snapshots)
+        return Motion(row, covariance), snapshots
 
     def pim(self, end: float = np.inf) -> gtsam.PreintegratedCombinedMeasurements:
         """GTSAM's, of the same steps up to a time."""
@@ -125,8 +135,8 @@ class Ends:
         )
 
     @property
-    def all(self) -> tuple[Array, Array, Array, Array]:
-        return self.R, self.p, self.v, self.bias
+    def all(self) -> States:
+        return States(self.R, self.p, self.v, self.bias)
 
 
 def ends(seed: int, bias: Array, n: int = 1) -> Ends:
@@ -135,20 +145,20 @@ def ends(seed: int, bias: Array, n: int = 1) -> Ends:
     return Ends(R, 20 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), bias + 0.03 * rng.normal(size=(n, 6)))
 
 
-def predict(row: Array, state: Ends) -> Ends:
-    return transition(row, state)[0]
+def predict(motion: Motion, state: Ends) -> Ends:
+    return transition(motion, state)[0]
 
 
-def error(row: Array, before: Ends, after: Ends) -> tuple[Array, Array, Array]:
+def error(motion: Motion, before: Ends, after: Ends) -> tuple[Array, Array, Array]:
     r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
-    motion_errors(row[None], *before.all, *after.all, r, A_i, A_j)
+    motion_errors(motion.row[None], before.all, after.all, r, A_i, A_j)
     return r[0], A_i[0], A_j[0]
 
 
-def transition(row: Array, before: Ends) -> tuple[Ends, Array, Array]:
+def transition(motion: Motion, before: Ends) -> tuple[Ends, Array, Array]:
     R, p, v = np.empty((1, 3, 3)), np.empty((1, 3)), np.empty((1, 3))
     F, Q = np.empty((1, 15, 15)), np.empty((1, 15, 15))
-    transitions(row[None], *before.all, R, p, v, F, Q)
+    transitions(motion.row[None], motion.covariance[None], before.all, States(R, p, v, before.bias), F, Q)
     return Ends(R, p, v, before.bias), F[0], Q[0]
 
 
@@ -180,7 +190,7 @@ def close(got: Array, expected: Array, relative: float = 1e-9) -> None:
 
 @cases
 def test_motion_is_that_of_gtsam(case):
-    row, _ = case.row()
+    (row, _), _ = case.integrated()
     pim = case.pim()
     assert row[DURATION] == pytest.approx(pim.deltaTij(), rel=1e-15)
     assert row[DURATION] == pytest.approx(case.end - case.start, rel=1e-12)
@@ -191,8 +201,8 @@ def test_motion_is_that_of_gtsam(case):
 
 @cases
 def test_covariance_is_that_of_gtsams_residual(case):
-    row, _ = case.row()
-    got, expected = row[COVARIANCE:].reshape(15, 15), case.pim().residualCovariance()
+    (_, got), _ = case.integrated()
+    expected = case.pim().residualCovariance()
     sd = np.sqrt(np.diag(expected))
     close(got / np.outer(sd, sd), expected / np.outer(sd, sd))
     np.testing.assert_array_equal(got, got.T)
@@ -201,17 +211,17 @@ def test_covariance_is_that_of_gtsams_residual(case):
 @cases
 def test_a_turning_earth_is_that_of_the_factors_noise(case):
     """What the factor itself whitens with."""
-    row, _ = case.row()
+    (_, covariance), _ = case.integrated()
     noise = gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, case.pim()).noiseModel().covariance()
     sd = np.sqrt(np.diag(noise))
-    close(row[COVARIANCE:].reshape(15, 15) / np.outer(sd, sd), noise / np.outer(sd, sd), 1e-7)
+    close(covariance / np.outer(sd, sd), noise / np.outer(sd, sd), 1e-7)
 
 
 @cases
 def test_derivative_by_the_bias_is_that_of_gtsams_prediction(case):
     """From rest at the origin, where prediction is the motion alone but for gravity."""
-    row, _ = case.row()
-    H = row[BY_BIAS:COVARIANCE].reshape(9, 6)
+    (row, _), _ = case.integrated()
+    H = row[BY_BIAS:].reshape(9, 6)
     still = replace(case, earth_rate=STILL).pim()
     by_bias = np.zeros((9, 6), order="F")
     there = still.predict(gtsam.NavState(), constant_bias(case.bias), np.zeros((9, 9), order="F"), by_bias)
@@ -231,7 +241,7 @@ def test_derivative_by_the_bias_is_that_of_gtsams_prediction(case):
 
 @cases
 def test_snapshots_are_motions_up_to_their_times(case):
-    _, snapshots = case.row()
+    _, snapshots = case.integrated()
     for stop, snapshot in zip(case.stops, snapshots, strict=True):
         pim = case.pim(stop)
         assert snapshot[0] == pytest.approx(stop - case.start, abs=1e-15)
@@ -256,16 +266,16 @@ def test_signals_are_linear_between_samples_and_held_beyond_them():
 
 
 def test_an_interval_without_time_has_no_motion():
-    row, _ = replace(calm(0), end=0.1, stops=np.empty(0)).row()
+    (row, covariance), _ = replace(calm(0), end=0.1, stops=np.empty(0)).integrated()
     assert row[DURATION] == 0.0
-    assert not row[TANGENT : TANGENT + 9].any() and not row[COVARIANCE:].any()
+    assert not row[TANGENT : TANGENT + 9].any() and not covariance.any()
 
 
 @cases
 def test_prediction_is_that_of_gtsam(case):
-    row, _ = case.row()
+    motion, _ = case.integrated()
     before = ends(1, case.bias)
-    got = predict(row, before)
+    got = predict(motion, before)
     state = gtsam.NavState(gtsam.Rot3(before.R[0]), before.p[0], before.v[0])
     there = case.pim().predict(state, constant_bias(before.bias[0]))
     close(got.R[0], there.attitude().matrix())
@@ -276,54 +286,54 @@ def test_prediction_is_that_of_gtsam(case):
 @cases
 @pytest.mark.parametrize("apart", [0.0, 1e-3, 0.7], ids=["on", "near", "far"])
 def test_residual_and_its_derivatives_are_those_of_gtsam(case, apart):
-    row, _ = case.row()
+    motion, _ = case.integrated()
     before = ends(2, case.bias)
     delta = apart * np.random.default_rng(3).normal(size=(1, 15))
-    after = predict(row, before).moved(delta)
-    for got, expected in zip(error(row, before, after), gtsam_error(case, before, after), strict=True):
+    after = predict(motion, before).moved(delta)
+    for got, expected in zip(error(motion, before, after), gtsam_error(case, before, after), strict=True):
         close(got, expected)
 
 
 @pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_derivatives_of_the_residual_are_those_of_its_values(case, gap):
-    row, _ = case.row(gap)
+    motion, _ = case.integrated(gap)
     before = ends(4, case.bias)
-    after = predict(row, before).moved(0.2 * np.random.default_rng(5).normal(size=(1, 15)))
-    _, A_i, A_j = error(row, before, after)
-    close(A_i, derivative(lambda d: error(row, before.moved(d), after)[0]), 1e-8)
-    close(A_j, derivative(lambda d: error(row, before, after.moved(d))[0]), 1e-8)
+    after = predict(motion, before).moved(0.2 * np.random.default_rng(5).normal(size=(1, 15)))
+    _, A_i, A_j = error(motion, before, after)
+    close(A_i, derivative(lambda d: error(motion, before.moved(d), after)[0]), 1e-8)
+    close(A_j, derivative(lambda d: error(motion, before, after.moved(d))[0]), 1e-8)
 
 
 @pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_transition_solves_the_linear_residual_at_the_prediction(case, gap):
-    row, _ = case.row(gap)
+    motion, _ = case.integrated(gap)
     before = ends(6, case.bias)
-    after, F, Q = transition(row, before)
-    r, A_i, A_j = error(row, before, after)
+    after, F, Q = transition(motion, before)
+    r, A_i, A_j = error(motion, before, after)
     np.testing.assert_allclose(r, 0.0, atol=1e-12)
-    S = np.linalg.inv(weight(row).T @ weight(row))
+    S = np.linalg.inv(weight(motion).T @ weight(motion))
     inverse = np.linalg.inv(A_j)
     close(F, -inverse @ A_i)
     close(Q, inverse @ S @ inverse.T, 1e-7)
 
 
-def weight(row: Array) -> Array:
+def weight(motion: Motion) -> Array:
     W = np.empty((1, 15, 15))
-    motion_weights(row[None], W)
+    motion_weights(motion.row[None], motion.covariance[None], W)
     return W[0]
 
 
 @pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_transition_carries_small_errors(case, gap):
-    row, _ = case.row(gap)
+    motion, _ = case.integrated(gap)
     before = ends(7, case.bias)
-    after, F, _ = transition(row, before)
+    after, F, _ = transition(motion, before)
 
     def moved(delta: Array) -> Array:
-        there = predict(row, before.moved(delta))
+        there = predict(motion, before.moved(delta))
         turn = log_rotation(after.R[0].T @ there.R[0])
         shift = after.R[0].T @ (there.p[0] - after.p[0])
         return np.concatenate([turn, shift, there.v[0] - after.v[0], there.bias[0] - after.bias[0]])
@@ -335,61 +345,61 @@ def test_transition_carries_small_errors(case, gap):
 @cases
 def test_weights_whiten_biases_first(case, gap):
     """So that the rows of biases are those of their walks, exactly."""
-    row, _ = case.row(gap)
-    W, S = weight(row), np.empty((15, 15))
-    motion_covariance(row, S)
+    motion, _ = case.integrated(gap)
+    W, S = weight(motion), np.empty((15, 15))
+    motion_covariance(*motion, S)
     biases_first = np.roll(np.arange(15), 6)
     ordered = W[np.ix_(biases_first, biases_first)]
     np.testing.assert_array_equal(ordered, np.tril(ordered))
     np.testing.assert_allclose(W @ S @ W.T, np.eye(15), atol=1e-6)
     before = ends(8, case.bias)
-    after = predict(row, before).moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
-    r, A_i, A_j = error(row, before, after)
-    motion = np.column_stack([A_i, r, A_j, np.zeros(15)])
-    whitened = np.empty_like(motion)
-    whiten_motion(W, motion, whitened)
-    close(whitened, W @ motion)
+    after = predict(motion, before).moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
+    r, A_i, A_j = error(motion, before, after)
+    rows = np.column_stack([A_i, r, A_j, np.zeros(15)])
+    whitened = np.empty_like(rows)
+    whiten_motion(W, rows, whitened)
+    close(whitened, W @ rows)
     for of_keyframe in (whitened[9:, :15], whitened[9:, 16:31]):
         np.testing.assert_array_equal(np.delete(of_keyframe, np.s_[9:15], axis=1), 0.0)
         np.testing.assert_array_equal(of_keyframe[:, 9:], np.diag(np.diagonal(of_keyframe[:, 9:])))
     alone = np.empty((1, 15))
-    two = (np.concatenate(both) for both in zip(before.all, after.all, strict=True))
-    motion_residuals(row[None], W[None], *two, np.empty((0, 6)), alone)
+    two = States(*(np.concatenate(both) for both in zip(before.all[:4], after.all[:4], strict=True)))
+    motion_residuals(motion.row[None], W[None], two, np.empty((0, 6)), alone)
     close(alone[0], W @ r)
 
 
 def test_many_intervals_are_each_alone():
-    rows = np.array([case.row(gap)[0] for case in CASES for gap in (0.0, 2.0, NO_IMU)])
-    before = ends(9, np.zeros(6), len(rows))
-    n = len(rows)
+    motions = [case.integrated(gap)[0] for case in CASES for gap in (0.0, 2.0, NO_IMU)]
+    rows, covariances, n = *map(np.array, zip(*motions, strict=True)), len(motions)
+    before = ends(9, np.zeros(6), n)
     R, p, v, F, Q = (np.empty((n, *shape)) for shape in ((3, 3), (3,), (3,), (15, 15), (15, 15)))
-    transitions(rows, *before.all, R, p, v, F, Q)
+    transitions(rows, covariances, before.all, States(R, p, v, before.bias), F, Q)
     after = Ends(R, p, v, before.bias).moved(0.1 * np.random.default_rng(1).normal(size=(n, 15)))
     r, A_i, A_j = np.empty((n, 15)), np.empty((n, 15, 15)), np.empty((n, 15, 15))
-    motion_errors(rows, *before.all, *after.all, r, A_i, A_j)
+    motion_errors(rows, before.all, after.all, r, A_i, A_j)
     for k in range(n):
-        one = Ends(*(a[k : k + 1] for a in before.all))
-        there, F_k, Q_k = transition(rows[k], one)
+        one = Ends(*(a[k : k + 1] for a in before.all[:4]))
+        there, F_k, Q_k = transition(motions[k], one)
         np.testing.assert_array_equal(there.R[0], R[k])
         np.testing.assert_array_equal(F_k, F[k])
         np.testing.assert_array_equal(Q_k, Q[k])
-        alone = error(rows[k], one, Ends(*(a[k : k + 1] for a in after.all)))
+        alone = error(motions[k], one, Ends(*(a[k : k + 1] for a in after.all[:4])))
         for got, expected in zip(alone, (r[k], A_i[k], A_j[k]), strict=True):
             np.testing.assert_array_equal(got, expected)
 
 
 def test_a_coasting_vehicle_goes_on_and_rights_itself():
     case = replace(calm(0), densities=np.array([0.3, 0.3, 1.6e-3, 8.7e-5, 1e-3]))
-    row, _ = case.row(2.0)
-    before = ends(10, case.bias)
-    after, t = predict(row, before), row[DURATION]
+    motion, _ = case.integrated(2.0)
+    row, before = motion.row, ends(10, case.bias)
+    after, t = predict(motion, before), row[DURATION]
     kept = np.exp(-t / RIGHTING_S)
     rpy = rpy_from_matrix(before.R[0]) * [kept, kept, 1.0]
     rpy[2] += rpy_from_matrix(exp_rotation(row[TANGENT : TANGENT + 3]))[2]
     np.testing.assert_allclose(wrap_angle(rpy_from_matrix(after.R[0]) - rpy), 0.0, atol=1e-12)
     np.testing.assert_allclose(after.p, before.p + t * before.v)
     np.testing.assert_array_equal(after.v, before.v)
-    S = np.linalg.inv(weight(row).T @ weight(row))
+    S = np.linalg.inv(weight(motion).T @ weight(motion))
     assert S[0, 0] == pytest.approx((1.0 - kept**2) * TILT_SD**2)
     assert S[2, 2] == pytest.approx(BRIDGE_GYR**2 * t)
     assert S[6, 6] == pytest.approx(BRIDGE_ACC**2 * t)

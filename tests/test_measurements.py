@@ -44,7 +44,7 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Meas
     """A block with motion to each measurement, and the state of its keyframes."""
     rng, instrument = np.random.default_rng(3), replace(SENSORS[sensor], loss=loss)
     state, dim = random_state(5, N), instrument.model.dim
-    blank = problem_of(np.zeros(N), np.empty((0, motion_row.ROW)))
+    blank = problem_of(np.zeros(N), np.empty((0, motion_row.ROW)), np.empty((0, 15, 15)))
     rows, scales, windows = np.zeros((N, at.Z + 2 * max(dim, at.MOST))), np.empty((N, 6, 6)), []
     for k in range(N):
         bias = state.bias[k] + 0.05 * rng.standard_normal(6)

@@ -50,7 +50,7 @@ def error(path: Path, config: Config, rate: float) -> np.ndarray:
     """Length of the error in attitude, velocity and position after the motion from START to END."""
     nothing = np.zeros(6)
     imu, stops = samples(path, config, rate), np.array([])
-    motion, _ = preintegrate(preintegration_params(config), nothing, imu, START, stops, END)
+    motion, *_ = preintegrate(preintegration_params(config), nothing, imu, START, stops, END)
     got = predict(motion, at_imu(path, config, START))
     true = at_imu(path, config, END)
     turn = log_rotation(true.R_nb[0].T @ got.R_nb[0])
@@ -72,12 +72,12 @@ def test_snapshots_are_what_separate_integrations_give(path):
     imu, bias = samples(path, config, 100.0), np.array([0.1, -0.1, 0.05, 0.01, -0.02, 0.03])
     params = preintegration_params(config)
     stops = np.array([START, START + 0.333, START + 0.333, START + 0.34, END])
-    _, snapshots = preintegrate(params, bias, imu, START, stops, END)
+    *_, snapshots = preintegrate(params, bias, imu, START, stops, END)
     assert len(snapshots) == len(stops)
     dt, dR, dv, dp = snapshots[:, 0], snapshots[:, 1:10].reshape(-1, 3, 3), snapshots[:, 10:13], snapshots[:, 13:]
     assert dt[0] == 0.0
     for k, stop in enumerate(stops[1:], 1):
-        alone, _ = preintegrate(params, bias, imu, START, np.array([]), float(stop))
+        alone, *_ = preintegrate(params, bias, imu, START, np.array([]), float(stop))
         assert dt[k] == pytest.approx(stop - START)
         # the last step of one is cut in the other
         np.testing.assert_allclose(dR[k], exp_rotation(moved(alone)[:3]), atol=1e-7)
@@ -88,7 +88,7 @@ def test_snapshots_are_what_separate_integrations_give(path):
 def test_intervals_that_meet_between_samples_lose_nothing(path):
     config, params = Config(), preintegration_params(Config())
     imu, none = samples(path, config, 50.0), np.array([])
-    whole, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
+    whole, *_ = preintegrate(params, np.zeros(6), imu, START, none, END)
     state = at_imu(path, config, START)
     cuts = np.array([START, START + 0.0071, START + 1.2345, START + 3.3333, END])
     there = state
@@ -105,8 +105,8 @@ def test_a_bias_is_taken_off_the_samples(path):
     imu = samples(path, config, 100.0)
     wrong = imu + np.append(0.0, bias)
     none, params = np.array([]), preintegration_params(config)
-    clean, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
-    known, _ = preintegrate(params, bias, wrong, START, none, END)
+    clean, *_ = preintegrate(params, np.zeros(6), imu, START, none, END)
+    known, *_ = preintegrate(params, bias, wrong, START, none, END)
     np.testing.assert_allclose(moved(known), moved(clean), atol=1e-9)
 
 
@@ -142,7 +142,7 @@ def still_heading(on: bool) -> float:
     params = preintegration_params(config)
     for begin in np.arange(0.0, STILL_S, 1.0):
         part = imu[(imu[:, 0] > begin - 0.2) & (imu[:, 0] < begin + 1.2)]
-        motion, _ = preintegrate(params, np.zeros(6), part, begin, np.array([]), begin + 1.0)
+        motion, *_ = preintegrate(params, np.zeros(6), part, begin, np.array([]), begin + 1.0)
         state = predict(motion, state)
     return float(rpy_from_matrix(state.R_nb[0])[2])
 
@@ -168,8 +168,7 @@ def test_a_gap_in_the_imu_is_bridged_with_an_inflated_covariance():
     bridged = np.flatnonzero(problem.bridged)
     assert len(bridged)
     assert ((problem.time[bridged] > 19.9) & (problem.time[bridged] < 23.3)).all()
-    motions = problem.motions
-    density = np.sqrt(motions[:, motion_row.COVARIANCE] / motions[:, motion_row.DURATION])  # of the rotation
+    density = np.sqrt(problem.covariances[:, 0, 0] / problem.motions[:, motion_row.DURATION])  # of the rotation
     assert density[bridged[1] - 1] == pytest.approx(BRIDGE_GYR, rel=0.1)
     assert density[bridged[1] - 1] > 50 * np.median(density[~problem.bridged[1:]])
     # and a ping in the gap knows that its rate is a guess

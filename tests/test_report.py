@@ -23,7 +23,7 @@ from rovgraph.geometry import matrix_from_rpy
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.report.folder import check_writable, results_folder
 from rovgraph.report.narrow import fitting
-from rovgraph.report.results import ellipse_axes, sensor_counts, summarise, to_plain, write_results
+from rovgraph.report.results import Remarks, ellipse_axes, sensor_counts, summarise, to_plain, write_results
 from rovgraph.report.tables import calibration_table, summary_table
 from rovgraph.report.units import plus_minus
 from rovgraph.trajectory import Trajectory, read_trajectory
@@ -163,7 +163,7 @@ def dive():
 def written(dive, tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     estimates, log, config, _ = dive
-    summary = write_results(folder, estimates, log, config, ["heading from the AHRS"], {"smooth": 1.5})
+    summary = write_results(folder, estimates, log, config, {"smooth": 1.5}, Remarks(["heading from the AHRS"]))
     return folder, summary
 
 
@@ -235,7 +235,7 @@ def test_full_disk_is_one_line_and_leaves_nothing(dive, tmp_path, monkeypatch):
 
     monkeypatch.setattr(pd.DataFrame, "to_csv", full)
     with pytest.raises(InputError) as caught, results_folder(tmp_path / "out") as folder:
-        write_results(folder, estimates, log, config, [], {})
+        write_results(folder, estimates, log, config, {}, Remarks())
     message = str(caught.value)
     assert "No space left on device" in message and "out" in message and "\n" not in message
     assert list(tmp_path.iterdir()) == []
@@ -405,7 +405,7 @@ def test_sensor_counts_count_measurements_not_components():
 
 def test_summary_and_trajectories_have_a_place_on_earth_where_the_log_has(dive, written, tmp_path):
     estimates, log, config, _ = dive
-    summary = write_results(tmp_path, estimates, replace(log, origin=(58.3, 14.5)), config, [], {})
+    summary = write_results(tmp_path, estimates, replace(log, origin=(58.3, 14.5)), config, {}, Remarks())
     assert summary["origin"] == {"lat_deg": 58.3, "lon_deg": 14.5} and written[1]["origin"] is None
     header = (tmp_path / "trajectory_smoothed.csv").read_text().partition("\n")[0]
     assert header.endswith(",cov_north_east,unix_time,lat,lon")  # the dive counts from 1970

@@ -143,7 +143,7 @@ class Result:
         """
         from rovgraph.live.marks import MARKS, marks_beside, write_marks
         from rovgraph.report.folder import results_folder
-        from rovgraph.report.results import write_results
+        from rovgraph.report.results import Remarks, write_results
 
         began = time.perf_counter()
         with results_folder(as_path(path, "path"), force, [Path(self.log.source)]) as folder:
@@ -159,10 +159,8 @@ class Result:
                 self.dive.estimates,
                 self.log,
                 self.config,
-                [*self.assumptions],
                 seconds,
-                [*self.alarms, *self.advice],
-                self.warnings,
+                Remarks(self.assumptions, [*self.alarms, *self.advice], self.warnings),
                 self.dive.frozen,
             )
             marks = marks_beside(Path(self.log.source), self.main.trajectory, self.log.origin)

@@ -137,8 +137,7 @@ def calibrate_magnetometer(
     require_turning(mag.data, log.source)
     imu = log.streams.get("imu")
     fit = _method(method, mag, imu, config, log.source)
-    shape, disturbances, used = _undisturbed(mag, imu, fit)
-    return _result(log.source, method, mag, imu, config, shape, disturbances, used)
+    return _result(log, method, config, *_undisturbed(mag, imu, fit))
 
 
 def _method(
@@ -197,16 +196,15 @@ def _outside(time: Array, disturbances: list[Disturbance]) -> NDArray[np.bool_]:
 
 
 def _result(
-    source: str,
+    log: Log,
     method: str,
-    mag: Stream,
-    imu: Stream | None,
     config: Config,
     shape: _Shape,
     disturbances: list[Disturbance] | None,
     used: NDArray[np.bool_],
 ) -> MagnetometerCalibration:
     """The calibration at its scale, with how well it fits."""
+    mag, imu = log["mag"], log.streams.get("imu")
     raw = mag.data[used]
     bare = np.linalg.norm((raw - shape.centre) @ shape.matrix.T, axis=1)
     wanted = config.environment.field_norm
@@ -219,7 +217,7 @@ def _result(
         for field, dip in zip((raw, calibrated), dips, strict=True)
     )
     return MagnetometerCalibration(
-        source=source,
+        source=log.source,
         method=method,
         centre=shape.centre,
         centre_sd=shape.centre_sd,

@@ -48,6 +48,7 @@ KEPT = 256  # keyframes that are never forgotten, for the noise that they have s
 BUFFER = 64  # rows of an array to begin with
 Place = tuple[float, int, int, float]  # time, precedence and number of the sensor, name of what is seen
 NEVER: Place = (-math.inf, 0, 0, 0.0)
+_BETWEEN = ("motions", "covariances", "weights", "scales", "rows", "row_scales", "windows")  # the keyframes
 _FATES = {
     at.EARLY: "before the first IMU sample",
     at.LATE: "after the last IMU sample",
@@ -266,6 +267,7 @@ class Assembly:
         if n > len(dive.motions) or more > len(dive.rows) or windows + late >= len(dive.windows):
             self._dive = dive._replace(
                 motions=_grown(dive.motions, begin, n),
+                covariances=_grown(dive.covariances, begin, n),
                 weights=_grown(dive.weights, begin, n),
                 scales=_grown(dive.scales, begin * scaled, n * scaled),
                 rows=_grown(dive.rows, rows, more),
@@ -330,6 +332,7 @@ class Assembly:
         self._dive = at.Dive(
             dive.keyframes[n:].copy(),
             dive.motions[n:].copy(),
+            dive.covariances[n:].copy(),
             dive.weights[n:].copy(),
             dive.scales[n * scaled :].copy(),
             dive.rows[rows:].copy(),
@@ -364,6 +367,7 @@ class Assembly:
             tuple(i.model.dim for i in self.instruments.values()),
             d.keyframes[:n],
             d.motions[1:n],
+            d.covariances[1:n],
             d.weights[1:n],
             d.scales[scaled : n * scaled],
             d.rows[:m],
@@ -403,7 +407,8 @@ class Assembly:
         dive.counts[[at.KEYFRAMES, at.FORGOTTEN]] = 2, known
         streams, rule = self._streams._replace(imu=table), self._rule._replace(learns=0.0)
         at.assemble(streams, self._listed[:0], rule, self._integration, dive, 1)
-        return replace(self.problem, keyframes=dive.keyframes, motions=dive.motions[1:], scales=dive.scales[1:])
+        motions, covariances, scales = dive.motions[1:], dive.covariances[1:], dive.scales[1:]
+        return replace(self.problem, keyframes=dive.keyframes, motions=motions, covariances=covariances, scales=scales)
 
     # files and twins
 
@@ -417,9 +422,8 @@ class Assembly:
         if not whole:
             twin._drop(max(n - KEPT, 0))
         counts, dive = twin._dive.counts, twin._dive
-        more = {name: getattr(dive, name) for name in ("motions", "weights", "scales", "rows", "row_scales", "windows")}
         return {
-            **(more if whole else {}),
+            **({name: getattr(dive, name) for name in _BETWEEN} if whole else {}),
             "imu": twin._table,
             "events": twin._events,
             "order": twin._order[: counts[at.ORDERED]],
@@ -454,7 +458,7 @@ class Assembly:
         self._dive = self._room(n, m, int(counts[at.WINDOWS]))._replace(counts=counts)
         self._dive.keyframes[:], self._dive.names[:] = state["keyframes"], state["names"]
         self._dive.rows[:, 0] = state["times"]
-        for name in ("motions", "weights", "scales", "rows", "row_scales", "windows") if "motions" in state else ():
+        for name in _BETWEEN if "motions" in state else ():
             here, there = getattr(self._dive, name), state[name]
             part = tuple(slice(min(sizes)) for sizes in zip(here.shape, there.shape, strict=True))
             here[part] = there[part]
@@ -538,6 +542,7 @@ class Assembly:
         return at.Dive(
             np.zeros((keyframes, at.KEYFRAME)),
             np.zeros((keyframes, motion_row.ROW)),
+            np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes * scaled, 6, 6)),
             np.zeros((rows, Z + 2 * self._most)),

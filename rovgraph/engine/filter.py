@@ -51,7 +51,7 @@ from rovgraph.state import PLACE, PLACE_DIM
 
 ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
 _EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
-_NO_MOTION = np.zeros(0)
+_NO_MOTION, _NO_COVARIANCE = np.zeros(0), np.zeros((0, 0))
 _NO_STATE = FilterState(_NO_MOTION, _NO_MOTION, *[np.zeros((0, 0))] * 3)  # where none is asked for
 
 
@@ -166,9 +166,9 @@ class FilterEngine:
 
     def _interval(self, problem: Problem, some: slice | Index, k: int = 0, between: int = 0) -> Interval:
         """Measurements, the first ones before the motion to keyframe k, if there is one, as kernels take them."""
-        motion = problem.motions[k - 1] if k else _NO_MOTION
+        motion, covariance = (problem.motions[k - 1], problem.covariances[k - 1]) if k else (_NO_MOTION, _NO_COVARIANCE)
         scale = problem.scales[k - 1] if k and len(problem.scales) else _EXACT[:, 0]
-        return Interval(motion, scale, problem.measured(some), between, *self._no_rows)
+        return Interval(motion, covariance, scale, problem.measured(some), between, *self._no_rows)
 
     def _take_interval(
         self,
@@ -203,14 +203,16 @@ class FilterEngine:
         before : the keyframe before them, without places
         gates : renewed in place
         """
+        assert len(problem.covariances) == len(problem.motions)  # kernels do not check where they read
         known, since = _state(before), self._since(gates)
         own = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
         taken, first = problem.taken[begin:end] - own.start, problem.first[begin:end] - own.start
         k, m, C, size = end - begin, own.stop - own.start, len(before.c), self.layout.size
         shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
-        motions, scales = problem.motions[begin - 1 : end - 1], problem.scales[begin - 1 : end - 1]
-        intervals = Intervals(motions, scales, np.append(0, taken), first, POORLY_KNOWN)
+        some = slice(begin - 1, end - 1)
+        motions, covariances, scales = problem.motions[some], problem.covariances[some], problem.scales[some]
+        intervals = Intervals(motions, covariances, scales, np.append(0, taken), first, POORLY_KNOWN)
         measured = problem.measured(own)
         done = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
@@ -386,5 +388,6 @@ class FilterEngine:
         """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
         which, window = np.array([self._index[PLACE]]), np.full(1, -1)
         own = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
-        known, out = self._take_interval(before, Interval(_NO_MOTION, _EXACT[:, 0], own, 0, r, H), None)
+        interval = Interval(_NO_MOTION, _NO_COVARIANCE, _EXACT[:, 0], own, 0, r, H)
+        known, out = self._take_interval(before, interval, None)
         return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

@@ -26,8 +26,9 @@ from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.linearization import States, linearize, place_measurements
+from rovgraph.kernels.linearization import linearize, place_measurements
 from rovgraph.kernels.measurement_row import MeasuredRows
+from rovgraph.kernels.states import States
 from rovgraph.kernels.weighting import LOSSES, weight_many, whiten_many
 from rovgraph.sensors import SENSORS, innovation
 from rovgraph.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY, Jacobians, State

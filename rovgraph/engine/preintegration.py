@@ -14,6 +14,7 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity
 from rovgraph.geometry import Array, earth_rate_n
 from rovgraph.kernels import motion_row as at
+from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.kernels.preintegration import preintegrate as integrate
 
@@ -82,7 +83,7 @@ def preintegrate(
     stops: Array,
     end: float,
     gap_s: float = 0.0,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Integrate IMU samples from ``start`` to ``end``.
 
     Parameters
@@ -98,8 +99,9 @@ def preintegrate(
     Returns
     -------
     motion : ndarray, shape (ROW,), of `rovgraph.kernels.motion_row`
+    covariance : ndarray, shape (15, 15), of its residual
     snapshots : ndarray, shape (k, SNAPSHOT), of `rovgraph.kernels.preintegration`
     """
-    row, snapshots = params.row(bias, gap_s), np.empty((len(stops), SNAPSHOT))
-    integrate(imu, start, end, stops, row, snapshots)
-    return row, snapshots
+    row, covariance, snapshots = params.row(bias, gap_s), np.empty((MOTION, MOTION)), np.empty((len(stops), SNAPSHOT))
+    integrate(imu, start, end, stops, row, covariance, snapshots)
+    return row, covariance, snapshots

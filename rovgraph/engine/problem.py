@@ -20,6 +20,7 @@ from rovgraph.kernels.measurement_row import MeasuredRows
 from rovgraph.kernels.motion import LONGEST_BRIDGED_S
 from rovgraph.kernels.motion_residual import motion_residuals
 from rovgraph.kernels.preintegration import integrated_steps
+from rovgraph.kernels.states import States
 from rovgraph.state import State
 
 Index = NDArray[np.int64]
@@ -33,8 +34,10 @@ class Problem:
     ----------
     sensors, dims : names of those in use, and how many components each measures
     keyframes : ndarray, shape (n, KEYFRAME), of `rovgraph.kernels.assembly`
-    motions, weights : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), of `rovgraph.kernels.motion_row`, and their
-        square-root information, of `rovgraph.kernels.motion_residual.motion_weights`
+    motions : ndarray, shape (n - 1, ROW), of `rovgraph.kernels.motion_row`
+    covariances : ndarray, shape (n - 1, 15, 15), of their residuals, or (0, 15, 15) where no filter needs them any more
+    weights : ndarray, shape (n - 1, 15, 15), their square-root information, of
+        `rovgraph.kernels.motion_residual.motion_weights`
     scales : ndarray, shape (n - 1, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
     rows : ndarray, shape (m, ROW) or wider, of `rovgraph.kernels.measurement_row`
     row_scales : ndarray, shape (m, 6, 6) or (0, 6, 6), as ``scales``
@@ -51,6 +54,7 @@ class Problem:
     dims: tuple[int, ...]
     keyframes: Array
     motions: Array
+    covariances: Array
     weights: Array
     scales: Array
     rows: Array
@@ -204,9 +208,10 @@ class Problem:
             of[[at.KEYFRAME_OF, at.INTERVAL_OF]] -= first
         scales, row_scales = self.scales[first : last - 1], self.row_scales[begin:end]
         more = replace(self, keyframes=keyframes, of=of, scales=scales, row_scales=row_scales)
-        motions, rows, names = self.motions[first : last - 1], self.rows[begin:end], self.names[begin:end]
+        motions, covariances, weights = (a[first : last - 1] for a in (self.motions, self.covariances, self.weights))
+        rows, names = self.rows[begin:end], self.names[begin:end]
         doubted = frozenset(row - begin for row in self.doubted if begin <= row < end)
-        more = replace(more, motions=motions, weights=self.weights[first : last - 1], doubted=doubted)
+        more = replace(more, motions=motions, covariances=covariances, weights=weights, doubted=doubted)
         return replace(more, rows=rows, names=names)
 
     def without(self, sensor: str) -> "Problem":
@@ -227,7 +232,7 @@ class Problem:
 
     def without_covariances(self) -> "Problem":
         """The same without the covariances of the motions, for a smoother, which has ``weights`` instead."""
-        return replace(self, motions=self.motions[:, : motion_row.COVARIANCE].copy())
+        return replace(self, covariances=np.empty((0, MOTION, MOTION)))
 
     # equations
 
@@ -241,8 +246,8 @@ class Problem:
         if len(self.scales):
             k = [np.broadcast_to(np.atleast_2d(state.calibration[s]), (len(self), 3))[1:] for s in SCALES]
             shift = rotate(self.scales, np.concatenate(k, axis=1))
-        R, p, v, b = (np.ascontiguousarray(a) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
-        motion_residuals(self.motions, self.weights, R, p, v, b, shift, r)
+        states = States(*map(np.ascontiguousarray, (state.R_nb, state.p_n, state.v_n, state.bias)))
+        motion_residuals(self.motions, self.weights, states, shift, r)
         return r
 
 

@@ -22,7 +22,7 @@ from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
-from rovgraph.kernels.dead_reckoning import reckon_attitude
+from rovgraph.kernels.dead_reckoning import Aiding, Motions, Start, Surroundings, reckon_attitude
 from rovgraph.kernels.measurement_row import ASSUMED, DP, DR, DT, DV, RATE, RATE_SD, TIME
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
@@ -188,23 +188,24 @@ def _attitudes(
     P = np.zeros((2, 3, 3))
     P[0] = np.diag([start.v_sd.max(), start.rpy_sd[:2].max(), gyr_sd]) ** 2
     P[1] = np.diag([0.0, start.rpy_sd[2], gyr_sd]) ** 2
-    held = 2.0 * KEEPS_HEADING_S * HELD_SD**2
-    numbers = np.array([env.gravity_mps2, PING_VALID_S, held, 0.0, *_earth_rate(config), *bottom.arm])
+    held, arm = 2.0 * KEEPS_HEADING_S * HELD_SD**2, np.require(bottom.arm, float, ("C", "W"))
+    around = Surroundings(env.gravity_mps2, PING_VALID_S, held, 0.0, _earth_rate(config), arm)
     dv = epochs.dv - epochs.dt[:, None] * (bias[:3] - epochs.assumed[:, :3])
-    motion = (epochs.outage, epochs.dt, epochs.dR, dv, epochs.assumed[:, 3:].copy(), _densities(epochs, config))
-    R_nb, gyr, reference = np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 3, 3))
-    began = start.state.R_nb[0].copy(), bias[3:].copy(), P
-    arguments: Any = (*motion, dvl, turns, reference, *began, numbers, R_nb, gyr)
-    reckon_attitude(*arguments)
+    assumed, densities = epochs.assumed[:, 3:].copy(), _densities(epochs, config)
+    motions = Motions(epochs.outage, epochs.dt, epochs.dR, dv, assumed, densities)
+    R_nb, gyr, aiding = np.empty((m, 3, 3)), np.empty((m, 3)), Aiding(dvl, turns, np.zeros((m, 3, 3)))
+    began = Start(start.state.R_nb[0].copy(), bias[3:].copy(), P)
+    reckon_attitude(motions, aiding, began, around, R_nb, gyr)
     k, headings = epochs.of(compass)
     if compass is not None and len(k):
         instrument = initial.instruments[compass]
         z = epochs.problem.z(headings, instrument.model.dim)
         turn = solve_turn(instrument, z, R_nb[k], calibration)
         noise = turn_noise(instrument, R_nb[k], turn, calibration, beliefs(config))
-        turns[k], reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
-        numbers[3] = P[1, 0, 0] = noise.deviation_var
-        reckon_attitude(*arguments)
+        turns[k], aiding.reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
+        P[1, 0, 0] = noise.deviation_var
+        around = around._replace(deviation_var=float(noise.deviation_var))
+        reckon_attitude(motions, aiding, began, around, R_nb, gyr)
     return R_nb, np.hstack([np.tile(bias[:3], (m, 1)), gyr])
 
 

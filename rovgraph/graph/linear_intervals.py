@@ -23,6 +23,7 @@ from rovgraph.geometry import Array, log_rotation, right_jacobian, rotate
 from rovgraph.kernels.assembly import SEGMENT
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion_residual import motion_errors
+from rovgraph.kernels.states import States
 
 _LET_IN = np.ones(1, bool)
 _SCALE = slice(ACC_SCALE, ACC_SCALE + 6)  # of the calibration vector
@@ -153,7 +154,7 @@ class Linearization:
             b_i, b_j = b_i + shift, b_j + shift
         R, p, v = x[first:, :9].reshape(-1, 3, 3).copy(), x[first:, 9:12].copy(), x[first:, 12:15].copy()
         own = r[first:], A_i[first:], A_j[first:]
-        motion_errors(rows, R[:-1], p[:-1], v[:-1], b_i, R[1:], p[1:], v[1:], b_j, *own)
+        motion_errors(rows, States(R[:-1], p[:-1], v[:-1], b_i), States(R[1:], p[1:], v[1:], b_j), *own)
         own[0][:], own[1][:], own[2][:] = rotate(W, own[0]), W @ own[1], W @ own[2]
         if S is not None:
             by_scale = (own[1][:, :, 9:] + own[2][:, :, 9:]) @ S  # of both alike, so that it is no walk of the bias

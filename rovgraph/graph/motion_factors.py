@@ -12,6 +12,7 @@ from rovgraph.geometry import Array
 from rovgraph.graph.keys import calibration_key, key
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.motion_residual import motion_errors
+from rovgraph.kernels.states import States
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 _ENDS = [6, 9, 15, 21, 24]  # of pose, velocity, bias of two keyframes side by side
@@ -62,19 +63,18 @@ def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Ma
     own, W, row = _keys(k), problem.weights[k - 1], problem.motions[k - 1 : k]
     S = problem.scales[k - 1] if len(problem.scales) else None
 
-    def state(values: gtsam.Values, pose: int, velocity: int, bias: int) -> tuple[Array, Array, Array, Array]:
+    def state(values: gtsam.Values, pose: int, velocity: int, bias: int) -> States:
         at_, v_n, b = values.atPose3(pose), values.atVector(velocity), values.atConstantBias(bias).vector()
         scales = {name: values.atVector(keys[name]) if name in keys else fixed[name] for name in SCALES}
         one = State(at_.rotation().matrix()[None], at_.translation()[None], v_n[None], b[None], scales)
         seen = one if S is None else biased(one, S[None])
         # copies: GTSAM's arrays may be read-only, which kernels do not take
-        R, p, v, bias_b = (np.array(a, order="C") for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
-        return R, p, v, bias_b
+        return States(*(np.array(a, order="C") for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias)))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
         ends = state(values, own[0], own[1], own[4]), state(values, own[2], own[3], own[5])
-        motion_errors(row, *ends[0], *ends[1], r, A_i, A_j)
+        motion_errors(row, *ends, r, A_i, A_j)
         if H is not None:
             J = W @ np.hstack([A_i[0], A_j[0]])
             pose_i, velocity_i, bias_i, pose_j, velocity_j, bias_j = np.split(J, _ENDS, axis=1)

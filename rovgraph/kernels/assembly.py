@@ -56,6 +56,7 @@ from rovgraph.kernels.imu_samples import (
     survey,
     typical_scatter,
 )
+from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.measurement_row import ASSUMED, KNOT_LAG, KNOT_RATE, MOST, RATE, RATE_SD, SNAPSHOT, Z
 from rovgraph.kernels.measurement_row import TIME as AT
 from rovgraph.kernels.motion_residual import motion_weight
@@ -145,8 +146,9 @@ class Dive(NamedTuple):
     Attributes
     ----------
     keyframes : shape (n, KEYFRAME)
-    motions, weights, scales : shapes (n, ROW), (n, 15, 15), (n, 6, 6) or (0, 6, 6), of the interval that ends with
-        each keyframe but the first
+    motions, covariances, weights : shapes (n, ROW), (n, 15, 15), (n, 15, 15), of the interval that ends with each
+        keyframe but the first
+    scales : shape (n, 6, 6), of it, too, or (0, 6, 6)
     rows, row_scales : shapes (m, Z + 2 D), (m, 6, 6) or (0, 6, 6)
     of : shape (OF, m), sensor, keyframe, interval, line, window or -1, number of a sighting or -1
     windows : shape (w, K, KNOT)
@@ -156,6 +158,7 @@ class Dive(NamedTuple):
 
     keyframes: Matrix
     motions: Matrix
+    covariances: Matrices
     weights: Matrices
     scales: Matrices
     rows: Matrix
@@ -420,7 +423,7 @@ def _window(
         stops[k] = stamp - lag[k]
     stops[count] = start
     stops, motion, snapshots = np.sort(stops), row.copy(), np.empty((count + 1, NUMBERS))
-    integrate(imu, begin, end, stops, motion, snapshots)
+    integrate(imu, begin, end, stops, motion, np.empty((MOTION, MOTION)), snapshots)
     own = snapshots[first_not_before_in(stops, start)]
     angle = np.zeros((len(imu), 3))
     for k in range(1, len(imu)):
@@ -493,7 +496,7 @@ def _motion(streams: Streams, rule: Rule, integration: Integration, dive: Dive, 
     keyframe, row = dive.keyframes[k], dive.motions[k]
     imu = streams.imu[int(keyframe[FIRST]) : int(keyframe[LAST])]
     longest, within, acc, gyr = survey(imu, dive.keyframes[k - 1, TIME], keyframe[TIME])
-    for i in range(motion_row.COVARIANCE):
+    for i in range(motion_row.ROW):
         row[i] = integration.row[i]
     keyframe[BELIEVED : BELIEVED + 2] = dive.keyframes[k - 1, BELIEVED : BELIEVED + 2]
     keyframe[SCATTER] = keyframe[SCATTER + 1] = math.nan
@@ -558,7 +561,6 @@ def _take(
     here: bool,
     event: Array,
     snapshot: Array,
-    longest_step: float,
 ) -> float:
     """Give a measurement its row; its fate.
 
@@ -569,7 +571,7 @@ def _take(
     start = keyframe[TIME] if here else dive.keyframes[k - 1, TIME]
     before = keyframe[TIME] if k == 0 else dive.keyframes[k - 1, TIME]
     every = imu[_first_covering(imu, before, rule.around) : int(keyframe[COUNT]) - counts[FORGOTTEN]]
-    window, number = -1, -1
+    window, number, longest_step = -1, -1, _longest_step(streams.steps, int(keyframe[COUNT]))
     if own[LAG] >= 0:
         window = counts[WINDOWS]
         lag = integration.lags[own[LAG]]
@@ -644,14 +646,15 @@ def assemble(streams: Streams, pieces: Matrix, rule: Rule, integration: Integrat
             chosen, stops = np.empty(room, np.int64), np.empty(room)
             found = _between(streams, rule, dive, k, pieces, chosen, stops)
             snapshots = np.empty((found, NUMBERS))
-            integrate(imu[first:last], before, time, stops[:found], dive.motions[k], snapshots)
-            motion_weight(dive.motions[k], dive.weights[k])
+            motion, covariance = dive.motions[k], dive.covariances[k]
+            integrate(imu[first:last], before, time, stops[:found], motion, covariance, snapshots)
+            motion_weight(motion, covariance, dive.weights[k])
             if rule.scaled != 0.0:
                 _scale_to_bias(imu[first:last], before, time, integration.row, integration.R_bs, dive.scales[k])
             for j in range(found):
                 piece = chosen[j] < 0
                 event = pieces[-1 - chosen[j]] if piece else streams.events[chosen[j]]
-                event[FATE] = _take(streams, rule, integration, dive, k, False, event, snapshots[j], longest_step)
+                event[FATE] = _take(streams, rule, integration, dive, k, False, event, snapshots[j])
         if rule.without_imu != 0.0:
             keyframe[RATE_B : RATE_B + 3], keyframe[SPREAD] = 0.0, rule.rate_sd
         else:
@@ -659,6 +662,6 @@ def assemble(streams: Streams, pieces: Matrix, rule: Rule, integration: Integrat
             keyframe[SPREAD] = _noise_of_rate(step, share, longest_step, keyframe[BELIEVED + 1])
         for j in range(int(keyframe[UPTO]) - int(keyframe[HERE]), int(keyframe[UPTO])):
             event = streams.events[streams.order[j]]
-            event[FATE] = _take(streams, rule, integration, dive, k, True, event, still, longest_step)
+            event[FATE] = _take(streams, rule, integration, dive, k, True, event, still)
         keyframe[TAKEN] = counts[ROWS]
         keyframe[FIRST], keyframe[LAST] = first + counts[FORGOTTEN], last + counts[FORGOTTEN]

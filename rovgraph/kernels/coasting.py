@@ -24,6 +24,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper
 from rovgraph.kernels.motion_row import AFTER, DURATION, NOISE, RESIDUAL, TANGENT
 from rovgraph.kernels.rotations import exp_rotation
+from rovgraph.kernels.states import Epoch
 
 BRIDGE_ACC, BRIDGE_GYR = 0.3, 0.3  # densities over a gap: an ROV at its liveliest [SI/rtHz]
 TILT_SD = math.radians(8.0)  # of a vehicle that rights itself
@@ -73,13 +74,13 @@ def _predict_angles(row: Array, R: Array, rpy_out: Array) -> None:
 
 
 @helper
-def coast(row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array) -> None:
-    """The state at the end of an interval."""
+def coast(row: Array, state: Epoch, out: Epoch) -> None:
+    """Attitude, position and velocity at the end of an interval."""
     rpy = np.empty(3)
-    _predict_angles(row, R, rpy)
-    _from_roll_pitch_yaw(rpy, R_out)
+    _predict_angles(row, state.R, rpy)
+    _from_roll_pitch_yaw(rpy, out.R)
     for i in range(3):
-        p_out[i], v_out[i] = p[i] + row[DURATION] * v[i], v[i]
+        out.p[i], out.v[i] = state.p[i] + row[DURATION] * state.v[i], state.v[i]
 
 
 @helper
@@ -101,25 +102,15 @@ def coasting_covariance(row: Array, S_out: Array) -> None:
 
 
 @helper
-def coasting_error(
-    row: Array,
-    R_i: Array,
-    p_i: Array,
-    v_i: Array,
-    bias_i: Array,
-    R_j: Array,
-    p_j: Array,
-    v_j: Array,
-    bias_j: Array,
-    A_out: Array,
-) -> None:
+def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> None:
     """Residual: roll, pitch, yaw, position, velocity, bias, and its derivatives by both states; ``A_out`` was zero."""
-    before, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    kept = _kept(row)
-    roll_pitch_yaw(R_i, before)
+    known, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    kept, R_i, p_i, v_i, bias_i = _kept(row), before.R, before.p, before.v, before.b
+    R_j, p_j, v_j, bias_j = after.R, after.p, after.v, after.b
+    roll_pitch_yaw(R_i, known)
     roll_pitch_yaw(R_j, rpy)
     _predict_angles(row, R_i, predicted)
-    _by_turn(before, B_i)
+    _by_turn(known, B_i)
     _by_turn(rpy, B_j)
     for i in range(15):
         A_out[i, i], A_out[i, AFTER + i] = -1.0, 1.0

@@ -54,6 +54,7 @@ Matrix = Annotated[Array, types.float64[:, ::1]]
 Matrices = Annotated[Array, types.float64[:, :, ::1]]  # one for each of n
 Index = Annotated[NDArray[np.int64], types.int64[::1]]
 Flags = Annotated[NDArray[np.bool_], types.boolean[::1]]
+FlagMatrix = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 IndexMatrix = Annotated[NDArray[np.int64], types.int64[:, ::1]]
 # arrays with any strides, which may be read-only; in no NamedTuple, whose fields numba does not convert
 AnyVector = Annotated[Array, types.Array(types.float64, 1, "A", readonly=True)]

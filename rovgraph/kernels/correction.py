@@ -19,7 +19,7 @@ from rovgraph.kernels.compile import helper
 from rovgraph.kernels.error_coordinates import local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.linearization import Keyframe, Scratch, linearize_measurement, make_scratch, pick
+from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch, pick
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME, MeasuredRows
 from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
@@ -33,6 +33,7 @@ from rovgraph.kernels.robust_update import (
     normalised_squared,
     reweight,
 )
+from rovgraph.kernels.states import epoch_in
 from rovgraph.kernels.velocity_coordinates import coordinates_of_velocity
 
 WIDE = 30.0  # sd of a prediction, in those of its measurement, from which it is corrected by iterations
@@ -61,10 +62,10 @@ def linearize_keyframe(
     Columns of what is considered, behind those of what is estimated, are multiplied by L.
     """
     which = measured.which
-    x, c, L, sensors, estimated = known.x, known.c, known.L, model.sensors, len(model.layout.columns)
+    L, sensors, estimated = known.L, model.sensors, len(model.layout.columns)
     first, r_out, H_out, H_y_out = found.first, found.r, found.H, found.H_y
     wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
-    state = Keyframe(x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21], c)
+    state = epoch_in(known.x, known.c)
     for j in range(len(which)):
         begin, end = first[j], first[j + 1]
         if sensors[which[j], KIND] != GIVEN:
@@ -111,6 +112,7 @@ def relinearize(
     coordinates = coordinates_of_velocity(x, P, layout)
     predicted_x, predicted_c, predicted_P, predicted_B = x.copy(), c.copy(), P.copy(), B.copy()
     delta, basis, work = np.empty(n), np.eye(size), make_coordinates_scratch(len(layout.seen), len(c))
+    state, predicted = epoch_in(x, c), epoch_in(predicted_x, predicted_c)
     for _ in range(MAX_RELINEARIZATIONS):
         reweight(found, weights)
         correction(found, weights, delta)
@@ -120,10 +122,8 @@ def relinearize(
             square = max(square, delta[i] * delta[i] / P[i, i])
         if square < STANDS * STANDS:
             return
-        R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-        retract(R, p, v, b, c, delta[0:size], coordinates, work, basis)
-        there = (predicted_x[0:9].reshape(3, 3), predicted_x[9:12], predicted_x[12:15], predicted_x[15:21], predicted_c)
-        local(R, p, v, b, c, there, coordinates, work, behind_out, basis)
+        retract(state, delta[0:size], coordinates, work, basis)
+        local(state, predicted, coordinates, work, behind_out, basis)
         for i in range(n):
             for k in range(n):
                 P[i, k] = predicted_P[i, k]

@@ -23,15 +23,16 @@ from rovgraph.kernels.rotations import (
     rotate_back,
     skew,
 )
+from rovgraph.kernels.states import Epoch
 
 
 @helper
-def cruise(row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array) -> None:
-    """The state at the end of an interval."""
+def cruise(row: Array, state: Epoch, out: Epoch) -> None:
+    """Attitude, position and velocity at the end of an interval."""
     for i in range(3):
-        p_out[i], v_out[i] = p[i] + row[DURATION] * v[i], v[i]
+        out.p[i], out.v[i] = state.p[i] + row[DURATION] * state.v[i], state.v[i]
         for j in range(3):
-            R_out[i, j] = R[i, j]
+            out.R[i, j] = state.R[i, j]
 
 
 @helper
@@ -50,18 +51,7 @@ def cruising_covariance(row: Array, S_out: Array) -> None:
 
 
 @helper
-def cruising_error(
-    row: Array,
-    R_i: Array,
-    p_i: Array,
-    v_i: Array,
-    bias_i: Array,
-    R_j: Array,
-    p_j: Array,
-    v_j: Array,
-    bias_j: Array,
-    A_out: Array,
-) -> None:
+def cruising_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> None:
     """Residual: rotation, position in n, velocity in the body's axes, bias; its derivatives by both states.
 
     ``A_out`` was zero.
@@ -74,6 +64,8 @@ def cruising_error(
         np.empty((3, 3)),
         np.empty(3),
     )
+    R_i, p_i, v_i, bias_i = before.R, before.p, before.v, before.b
+    R_j, p_j, v_j, bias_j = after.R, after.p, after.v, after.b
     multiply_transposed(R_i, R_j, turn)
     log_rotation(turn, phi)
     inverse_right_jacobian(phi, Jr)

@@ -19,11 +19,12 @@ in which the compass measures deviation plus heading. Gains are those of a Kalma
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import Flags, Matrices, Matrix, Vector, helper, kernel
 from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, rotate, rotate_back
 
 ANGLE, DRIFT = 1, 2  # components of a chain, after velocity or deviation
@@ -32,6 +33,92 @@ SINCE, CLIPPED, DEVIATION = 0, 1, 2  # of a sensor: time since its last measurem
 CLIP_SD = 4.0  # at which innovations are clipped
 INFLATE_AFTER_S = 5.0  # of innovations that are all clipped the attitude's covariance is inflated
 SHORTEST_S = 0.02  # between two velocities
+
+
+class Motions(NamedTuple):
+    """The IMU's motion to each of m epochs from the one before, zero where it is none.
+
+    Attributes
+    ----------
+    outage : shape (m,), bool, the IMU had an outage meanwhile
+    dt, dR, dv : shapes (m,), (m, 3, 3), (m, 3) [s, -, m/s]
+    assumed : shape (m, 3), gyro bias that dR is for [rad/s]
+    density : shape (m, 3), squared densities of the noise of specific force, of rate, and of the gyro's walk
+    """
+
+    outage: Flags
+    dt: Vector
+    dR: Matrices
+    dv: Matrix
+    assumed: Matrix
+    density: Matrix
+
+
+class Aiding(NamedTuple):
+    """What is measured at m epochs.
+
+    Attributes
+    ----------
+    dvl : shape (m, 4), velocity of the IMU by the DVL, body axes, but for what the gyro's bias does over the lever
+        arm [m/s], and the variance of an axis, infinite = no ping
+    compass : shape (m, 3), angle about down from the attitude ``reference`` to the one that the compass shows [rad],
+        its variance, infinite = no heading, and what it grows by with the variance of tilt
+    reference : shape (m, 3, 3)
+    """
+
+    dvl: Matrix
+    compass: Matrix
+    reference: Matrices
+
+
+class Start(NamedTuple):
+    """Before the first epoch.
+
+    Attributes
+    ----------
+    R, bias : shapes (3, 3), (3,), attitude and the gyro's bias
+    P : shape (2, 3, 3), covariances of the chains of velocity and tilt, and of deviation and heading
+    """
+
+    R: Matrix
+    bias: Vector
+    P: Matrices
+
+
+class Surroundings(NamedTuple):
+    """What is taken as known.
+
+    Attributes
+    ----------
+    gravity : [m/s^2]
+    valid_s : for how long a ping says how fast the vehicle is [s]
+    held : squared density of the noise of a velocity that is held from then on
+    deviation_var : of the compass [rad^2]
+    w_ie_n : rate of the Earth in n [rad/s]
+    arm : lever arm of the DVL from the IMU [m]
+    """
+
+    gravity: float
+    valid_s: float
+    held: float
+    deviation_var: float
+    w_ie_n: Vector
+    arm: Vector
+
+
+class Reckoned(NamedTuple):
+    """Attitude, velocity in n and the gyro's bias so far, shapes (3, 3), (3,), (3,)."""
+
+    R: Array
+    v_n: Array
+    bias: Array
+
+
+class Chain(NamedTuple):
+    """Covariance of one chain, shape (3, 3), and what is kept of the sensor that corrects it, shape (3,)."""
+
+    P: Array
+    history: Array
 
 
 @helper
@@ -91,8 +178,9 @@ def _rotate_about_n(R: Array, north: float, east: float, down: float, work: Arra
 
 
 @helper
-def _propagate_attitude(R: Array, v_n: Array, dR: Array, dv: Array, outage: bool, work: Array) -> None:
+def _propagate_attitude(known: Reckoned, dR: Array, dv: Array, outage: bool, work: Array) -> None:
     """Attitude and horizontal velocity after a motion; during an outage of the IMU only heading changes."""
+    R, v_n = known.R, known.v_n
     if outage:
         _rotate_about_n(R, 0.0, 0.0, math.atan2(dR[1, 0], dR[0, 0]), work)
         return
@@ -105,12 +193,13 @@ def _propagate_attitude(R: Array, v_n: Array, dR: Array, dv: Array, outage: bool
 
 
 @helper
-def _clip(P: Array, history: Array, innovation: float, sd: float, by_angle: float) -> float:
+def _clip(chain: Chain, innovation: float, sd: float, by_angle: float) -> float:
     """Share of an innovation that is used; inflates the covariance of the angle where it stays too large.
 
     A clipped innovation corrects neither drift nor deviation: it may be wrong itself. After `INFLATE_AFTER_S` of them
     the angle is taken to be off by what explains the innovation, which changes by ``by_angle`` per radian.
     """
+    P, history = chain
     share, since = CLIP_SD * sd / max(innovation, 1e-12), history[SINCE]
     history[SINCE] = 0.0
     if share >= 1.0:
@@ -126,25 +215,16 @@ def _clip(P: Array, history: Array, innovation: float, sd: float, by_angle: floa
 
 
 @helper
-def _correct_tilt(
-    R: Array,
-    v_n: Array,
-    bias: Array,
-    P: Array,
-    history: Array,
-    v_b: Array,
-    variance: float,
-    gravity: float,
-    work: Array,
-) -> None:
+def _correct_tilt(known: Reckoned, chain: Chain, v_b: Array, variance: float, gravity: float, work: Array) -> None:
     """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
+    R, v_n, bias = known
     measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
     rotate(R, v_b, measured)
-    north, east, since = measured[0] - v_n[0], measured[1] - v_n[1], history[SINCE]
-    sd = _kalman_gains(P, 0.0, variance, gain)
+    north, east, since = measured[0] - v_n[0], measured[1] - v_n[1], chain.history[SINCE]
+    sd = _kalman_gains(chain.P, 0.0, variance, gain)
     v_n[0] += gain[0] * north
     v_n[1] += gain[0] * east
-    share = _clip(P, history, math.hypot(north, east), sd, gravity * max(since, SHORTEST_S))
+    share = _clip(chain, math.hypot(north, east), sd, gravity * max(since, SHORTEST_S))
     angle, drift = share * gain[ANGLE], gain[DRIFT] if share == 1.0 else 0.0
     beta[0], beta[1], beta[2] = drift * east, -drift * north, 0.0
     rotate_back(R, beta, measured)
@@ -154,17 +234,16 @@ def _correct_tilt(
 
 
 @helper
-def _correct_heading(
-    R: Array, v_n: Array, bias: Array, P: Array, history: Array, innovation: float, variance: float, work: Array
-) -> None:
+def _correct_heading(known: Reckoned, chain: Chain, innovation: float, variance: float, work: Array) -> None:
     """Heading, the vertical bias of the gyro and the compass's deviation corrected by a compass."""
+    R, v_n, bias = known
     gain = work[0, 1]
     innovation -= 2.0 * math.pi * math.floor(innovation / (2.0 * math.pi) + 0.5)
-    sd = _kalman_gains(P, 1.0, variance, gain)
-    share = _clip(P, history, abs(innovation), sd, 1.0)
+    sd = _kalman_gains(chain.P, 1.0, variance, gain)
+    share = _clip(chain, abs(innovation), sd, 1.0)
     angle, drift = share * gain[ANGLE] * innovation, 0.0
     if share == 1.0:
-        history[DEVIATION] += gain[0] * innovation
+        chain.history[DEVIATION] += gain[0] * innovation
         drift = gain[DRIFT] * innovation
     _rotate_about_n(R, 0.0, 0.0, angle, work)
     north, east = v_n[0], v_n[1]
@@ -181,51 +260,17 @@ def _angle_about_down(R: Array, reference: Array) -> float:
     return math.atan2(sine, dot(R[0], reference[0]) + dot(R[1], reference[1]))
 
 
-@kernel(
-    "void(b1[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1],"
-    " f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1])"
-)
+@kernel()
 def reckon_attitude(
-    outage: Array,
-    dt: Array,
-    dR: Array,
-    dv: Array,
-    assumed: Array,
-    density: Array,
-    dvl: Array,
-    compass: Array,
-    reference: Array,
-    R_start: Array,
-    bias_start: Array,
-    P_start: Array,
-    numbers: Array,
-    R_out: Array,
-    bias_out: Array,
+    motions: Motions, aiding: Aiding, start: Start, around: Surroundings, R_out: Matrices, bias_out: Matrix
 ) -> None:
-    """Attitude and gyro bias at m epochs, each after the measurement that it has.
-
-    Parameters
-    ----------
-    outage : shape (m,), bool, the IMU had an outage since the epoch before
-    dt, dR, dv : shapes (m,), (m, 3, 3), (m, 3), motion since then [s, -, m/s]
-    assumed : shape (m, 3), gyro bias that dR is for [rad/s]
-    density : shape (m, 3), squared densities of the noise of specific force, of rate, and of the gyro's walk
-    dvl : shape (m, 4), velocity of the IMU by the DVL, body axes, but for what the gyro's bias does over the lever
-        arm [m/s], and the variance of an axis, infinite = no ping
-    compass : shape (m, 3), angle about down from the attitude ``reference``, shape (m, 3, 3), to the one that the
-        compass shows [rad], its variance, infinite = no heading, and what it grows by with the variance of tilt
-    R_start, bias_start, P_start : shapes (3, 3), (3,), (2, 3, 3), before the first epoch, covariances of the chains
-        of velocity and tilt, and of deviation and heading
-    numbers : shape (10,), gravity [m/s^2]; for how long a ping says how fast the vehicle is [s], and the squared
-        density of the noise of a velocity that is held from then on; variance of the compass's deviation [rad^2];
-        rate of the Earth in n [rad/s]; lever arm of the DVL from the IMU [m]
-    R_out, bias_out : shapes (m, 3, 3), (m, 3)
-    """
-    gravity, valid_s, held, deviation_var = numbers[0], numbers[1], numbers[2], numbers[3]
-    w_ie_n, arm = numbers[4:7], numbers[7:10]
-    R, bias, v_n, v_b = R_start.copy(), bias_start.copy(), np.zeros(3), np.zeros(3)
-    tilt, heading, since_ping = P_start[0].copy(), P_start[1].copy(), 0.0
-    dvl_history, compass_history = np.zeros(3), np.zeros(3)
+    """Attitude and gyro bias at m epochs, shapes (m, 3, 3), (m, 3), each after the measurement that it has."""
+    outage, dt, dR, dv, assumed, density = motions
+    dvl, compass, reference = aiding
+    gravity, valid_s, held, deviation_var, w_ie_n, arm = around
+    R, bias, v_n, v_b = start.R.copy(), start.bias.copy(), np.zeros(3), np.zeros(3)
+    tilt, heading, since_ping = Chain(start.P[0].copy(), np.zeros(3)), Chain(start.P[1].copy(), np.zeros(3)), 0.0
+    known, dvl_history, compass_history = Reckoned(R, v_n, bias), tilt.history, heading.history
     work, turn, moved = np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(len(dt)):
         if dt[k] > 0.0:
@@ -233,13 +278,13 @@ def reckon_attitude(
                 moved[i] = -dt[k] * (bias[i] - assumed[k, i])
             exp_rotation(moved, work[0])
             multiply(dR[k], work[0], turn)
-            _propagate_attitude(R, v_n, turn, dv[k], outage[k], work)
+            _propagate_attitude(known, turn, dv[k], outage[k], work)
             _rotate_about_n(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
             kept = math.exp(-abs(math.atan2(turn[1, 0], turn[0, 0])) / DEVIATES_OVER)
             compass_history[DEVIATION] *= kept
             pull = 0.0 if outage[k] else gravity
-            _propagate_covariance(tilt, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
-            _propagate_covariance(heading, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
+            _propagate_covariance(tilt.P, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
+            _propagate_covariance(heading.P, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
             since_ping += dt[k]
             dvl_history[SINCE] += dt[k]
             compass_history[SINCE] += dt[k]
@@ -253,11 +298,11 @@ def reckon_attitude(
         elif since_ping > valid_s and dvl_history[SINCE] > 0.5 * valid_s:
             variance = held / dvl_history[SINCE]
         if variance < math.inf:
-            _correct_tilt(R, v_n, bias, tilt, dvl_history, v_b, variance, gravity, work)
+            _correct_tilt(known, tilt, v_b, variance, gravity, work)
         if compass[k, 1] < math.inf:
-            variance = compass[k, 1] + compass[k, 2] * tilt[ANGLE, ANGLE]
+            variance = compass[k, 1] + compass[k, 2] * tilt.P[ANGLE, ANGLE]
             innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - compass_history[DEVIATION]
-            _correct_heading(R, v_n, bias, heading, compass_history, innovation, variance, work)
+            _correct_heading(known, heading, innovation, variance, work)
         _copy(R, R_out[k])
         for i in range(3):
             bias_out[k, i] = bias[i]

@@ -26,8 +26,6 @@ from rovgraph.kernels.compile import Flags, Index, Matrices, Matrix, Vector, ker
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.linearization import (
     Scratch,
-    States,
-    keyframe,
     linearize_measurement,
     make_scratch,
     pick,
@@ -36,6 +34,7 @@ from rovgraph.kernels.linearization import (
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST, MeasuredRows
 from rovgraph.kernels.motion_residual import make_residual_scratch, motion_error, whiten_motion
 from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
+from rovgraph.kernels.states import States, epoch, with_bias
 from rovgraph.kernels.weighting import loss_weight, robust_cost
 
 
@@ -66,7 +65,7 @@ def load_linearized(
     k: int, row: int, point: States, dive: DiveFactors, entered: Flags, room: Room, scratch: Scratch, r: Vector
 ) -> int:
     """Weighted rows of the measurements of keyframe k into V from ``row`` on; returns the row after them."""
-    state, which, sensors = keyframe(point, k), dive.measured.which, dive.sensors
+    state, which, sensors = epoch(point, k), dive.measured.which, dive.sensors
     V, sums, last = room.V, room.scale, len(room.scale)
     for m in range(dive.first[k], dive.first[k + 1]):
         sensor = sensors[which[m]]
@@ -110,9 +109,9 @@ def eliminate_dive(
     border_rows : as `rovgraph.kernels.linear_chain.eliminate`
     out : of fewer conditionals than keyframes the last one is that of the last keyframe
     """
-    R, p, v, b, c = point
+    b, c = point.b, point.c
     scales, first, given_first = dive.scales, dive.first, given.first
-    n, d, size = len(R), out.conditionals.shape[1], c.shape[1]
+    n, d, size = len(b), out.conditionals.shape[1], c.shape[1]
     most, of_c, of_scale = 0, len(c) > 1, len(scales) > 0
     for k in range(n):
         most = max(most, given_first[k + 1] - given_first[k] + MOST * (first[k + 1] - first[k]))
@@ -133,8 +132,8 @@ def eliminate_dive(
                 for j in range(len(targets)):
                     shift += scales[k, i, j] * c[(k + 1) * of_c, ACC_SCALE + j]
                 bias[0, i], bias[1, i] = b[k, i] + shift, b[k + 1, i] + shift
-            after = R[k + 1], p[k + 1], v[k + 1], bias[1]
-            motion_error(dive.motions[k], R[k], p[k], v[k], bias[0], *after, unwhitened, moving)
+            before, after = with_bias(epoch(point, k), bias[0]), with_bias(epoch(point, k + 1), bias[1])
+            motion_error(dive.motions[k], before, after, unwhitened, moving)
             whiten_motion(dive.W[k], unwhitened, A)
             for i in range(MOTION):
                 A[i, RESIDUAL] = -A[i, RESIDUAL]
@@ -155,7 +154,7 @@ def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> Non
     first, sensors, which = dive.first, dive.sensors, dive.measured.which
     scratch = make_scratch(point.c.shape[1], np.empty(0, np.int64))
     for k in range(len(first) - 1):
-        state = keyframe(point, k)
+        state = epoch(point, k)
         for m in range(first[k], first[k + 1]):
             square_out[m] = 0.0
             if sensors[which[m], KIND] != GIVEN:

@@ -42,6 +42,7 @@ from rovgraph.kernels.rotations import (
     rotate,
     rotate_back,
 )
+from rovgraph.kernels.states import Epoch
 
 Indices = NDArray[np.int64]
 
@@ -90,12 +91,10 @@ def make_scratch(instruments: int, calibration_size: int) -> Scratch:
 
 
 @view_helper
-def _see(
-    s: int, which: int, R: Array, p: Array, v: Array, b: Array, c: Array, layout: ErrorLayout, scratch: Scratch
-) -> None:
+def _see(s: int, which: int, state: Epoch, layout: ErrorLayout, scratch: Scratch) -> None:
     """What instrument ``s`` sees of a state."""
     z, H, rate = scratch.z[which, s], scratch.H[which, s], scratch.work[ZERO, 0]
-    predict(layout.seen[s, 0], R, p, v, b, c, rate, layout.params[s], z, H, scratch.work)
+    predict(layout.seen[s, 0], state, rate, layout.params[s], z, H, scratch.work)
 
 
 @view_helper
@@ -159,17 +158,7 @@ def _rows_of_seen(
 
 
 @view_helper
-def retract(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    delta: Array,
-    layout: ErrorLayout,
-    scratch: Scratch,
-    basis_out: Array,
-) -> None:
+def retract(state: Epoch, delta: Array, layout: ErrorLayout, scratch: Scratch, basis_out: Array) -> None:
     """Move a state by ``delta``, in place.
 
     ``basis_out``, shape (size, size), takes an error about the old state over to the new one, to first order in
@@ -177,25 +166,26 @@ def retract(
     """
     seen, columns, back, inverse = layout.seen, layout.columns, scratch.work[TURN], scratch.work[STEP]
     for s in range(len(seen)):
-        _see(s, 0, R, p, v, b, c, layout, scratch)
-    _move(R, p, v, b, c, delta, columns, scratch.work)
+        _see(s, 0, state, layout, scratch)
+    _move(state, delta, columns, scratch.work)
     _rows_of_pose(back, basis_out)
     for s in range(len(seen)):
         kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]
-        _see(s, 1, R, p, v, b, c, layout, scratch)
+        _see(s, 1, state, layout, scratch)
         before, after = scratch.H[0, s], scratch.H[1, s]
         _inverse_of_seen(after, first, dim, columns, inverse)
         for k in range(dim):
             missing = scratch.z[0, s, k] + _product(before[k], delta, columns) - scratch.z[1, s, k]
             missing = wrap(missing) if is_angular(kind) else missing
             for i in range(dim):
-                _add(first + i, inverse[i, k] * missing, v, c, columns)
+                _add(first + i, inverse[i, k] * missing, state.v, state.c, columns)
         _rows_of_seen(before, after, inverse, back, first, dim, columns, basis_out)
 
 
 @view_helper
-def _move(R: Array, p: Array, v: Array, b: Array, c: Array, delta: Array, columns: Indices, work: Array) -> None:
+def _move(state: Epoch, delta: Array, columns: Indices, work: Array) -> None:
     """All variables moved by themselves, in place; ``work[TURN]`` becomes R'^T R."""
+    R, p, v, b, c = state
     back, step, moved, shift = work[TURN], work[STEP], work[REST], work[TURN, 0]
     rotate(R, delta[TRANSLATION:VELOCITY], shift)
     for i in range(3):
@@ -233,39 +223,29 @@ def _product(row: Array, delta: Array, columns: Indices) -> float:
 
 @view_helper
 def local(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    other: tuple[Array, Array, Array, Array, Array],
-    layout: ErrorLayout,
-    scratch: Scratch,
-    delta_out: Array,
-    basis_out: Array,
+    state: Epoch, other: Epoch, layout: ErrorLayout, scratch: Scratch, delta_out: Array, basis_out: Array
 ) -> None:
-    """The error that leads from a state to another one, of (R, p, v, b, c): the inverse of `retract`.
+    """The error that leads from a state to another one: the inverse of `retract`.
 
     ``basis_out``, as of `retract`, takes an error about the other state over to the first.
     """
     seen, columns, turn, inverse = layout.seen, layout.columns, scratch.work[TURN], scratch.work[STEP]
-    other_R, other_p, other_v, other_b, other_c = other
-    multiply_transposed(R, other_R, turn)
+    multiply_transposed(state.R, other.R, turn)
     log_rotation(turn, delta_out[0:3])
     apart = scratch.work[REST, 0]
     for i in range(3):
-        apart[i] = other_p[i] - p[i]
-        delta_out[VELOCITY + i] = other_v[i] - v[i]
-        delta_out[ACC_BIAS + i] = other_b[i] - b[i]
-        delta_out[ACC_BIAS + 3 + i] = other_b[3 + i] - b[3 + i]
-    rotate_back(R, apart, delta_out[TRANSLATION:VELOCITY])
+        apart[i] = other.p[i] - state.p[i]
+        delta_out[VELOCITY + i] = other.v[i] - state.v[i]
+        delta_out[ACC_BIAS + i] = other.b[i] - state.b[i]
+        delta_out[ACC_BIAS + 3 + i] = other.b[3 + i] - state.b[3 + i]
+    rotate_back(state.R, apart, delta_out[TRANSLATION:VELOCITY])
     for i in range(MOTION, len(columns)):
-        delta_out[i] = other_c[columns[i] - MOTION] - c[columns[i] - MOTION]
+        delta_out[i] = other.c[columns[i] - MOTION] - state.c[columns[i] - MOTION]
     _rows_of_pose(turn, basis_out)
     for s in range(len(seen)):
         kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]
-        _see(s, 0, R, p, v, b, c, layout, scratch)
-        _see(s, 1, other_R, other_p, other_v, other_b, other_c, layout, scratch)
+        _see(s, 0, state, layout, scratch)
+        _see(s, 1, other, layout, scratch)
         here, there = scratch.H[0, s], scratch.H[1, s]
         _inverse_of_seen(here, first, dim, columns, inverse)
         for k in range(dim):  # all of them first: they depend on what they correct

@@ -79,6 +79,7 @@ class Interval(NamedTuple):
     Attributes
     ----------
     motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
+    covariance : of the motion's residual, shape (15, 15)
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     measured : its measurements
     between : how many of them, the first ones, belong to the keyframe before
@@ -86,6 +87,7 @@ class Interval(NamedTuple):
     """
 
     motion: Vector
+    covariance: Matrix
     scale: Matrix
     measured: MeasuredRows
     between: int
@@ -133,7 +135,7 @@ def take_interval(
     for arrived in range(2):
         if arrived and len(interval.motion):
             _keep(known, out.departed)
-            predict_filter(known, interval.motion, interval.scale, model, out.F, out.Q)
+            predict_filter(known, interval.motion, interval.covariance, interval.scale, model, out.F, out.Q)
             _keep(known, out.predicted)
         begin, end = (between, len(interval.measured.which)) if arrived else (0, between)
         if begin < end:
@@ -148,13 +150,15 @@ class Intervals(NamedTuple):
 
     Attributes
     ----------
-    motions, scales : shapes (k, ROW), (k, 6, 6) or (0, 6, 6), as of `rovgraph.kernels.dive`
+    motions, covariances : shapes (k, ROW), (k, 15, 15), of their residuals
+    scales : shape (k, 6, 6) or (0, 6, 6), as of `rovgraph.kernels.dive`
     taken : shape (k + 1,), the first measurement of each, and how many there are
     here : shape (k,), the first measurement at the keyframe that ends each
     poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
     """
 
     motions: Matrix
+    covariances: Matrices
     scales: Matrices
     taken: Index
     here: Index
@@ -217,7 +221,8 @@ def filter_intervals(
             return k
         scale = intervals.scales[k] if len(intervals.scales) else exact
         some = some_of(measured, begin, end)
-        interval = Interval(intervals.motions[k], scale, some, here[k] - begin, nothing, none)
+        motion, covariance = intervals.motions[k], intervals.covariances[k]
+        interval = Interval(motion, covariance, scale, some, here[k] - begin, nothing, none)
         predicted = FilterState(out.predicted_x[k], out.predicted_c[k], exact, exact, exact)
         taken_out = Taken(untold, predicted, F, Q, out.nis[begin:end], out.weight[begin:end], nothing)
         take_interval(known, interval, model, since, True, taken_out)

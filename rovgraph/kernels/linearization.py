@@ -52,19 +52,10 @@ from rovgraph.kernels.measurement_row import (
 from rovgraph.kernels.measurements import WORK as PREDICT_WORK
 from rovgraph.kernels.measurements import is_angular, predict
 from rovgraph.kernels.propagation import WORK as PROPAGATE_WORK
-from rovgraph.kernels.propagation import chain, propagate, propagation_jacobian
+from rovgraph.kernels.propagation import Snapshot, chain, propagate, propagation_jacobian
 from rovgraph.kernels.rotations import exp_rotation, log_rotation, multiply, multiply_transposed, rotate, rotate_back
+from rovgraph.kernels.states import Epoch, States, epoch
 from rovgraph.kernels.weighting import loss_weight, whiten
-
-
-class Keyframe(NamedTuple):
-    """A keyframe's state, as `rovgraph.kernels.measurements.predict` takes it, and calibration vector."""
-
-    R: Array
-    p: Array
-    v: Array
-    b: Array
-    c: Array
 
 
 class Measured(NamedTuple):
@@ -91,7 +82,7 @@ class Scratch(NamedTuple):
     bias : shape (6,), of the keyframe and of the IMU's scale
     z, H : shapes (3,), (3, 15 + C), predicted measurement, then the innovation; its derivative
     W : shape (3, 3), square-root information, lower triangular
-    R, there : shapes (3, 3), (2, 3), attitude, position and velocity at the measurement's time
+    R, p, v : attitude, position and velocity at the measurement's time
     rate, by_offset : shapes (3,), (4, 3), rate there; how rotation, position, velocity and rate go with a late stamp
     F : shape (15, 15), zero at first
     knot, placing : shapes (KNOT,), (4, 3, 3), to place a late stamp with
@@ -105,7 +96,8 @@ class Scratch(NamedTuple):
     H: Array
     W: Array
     R: Array
-    there: Array
+    p: Array
+    v: Array
     rate: Array
     by_offset: Array
     F: Array
@@ -131,10 +123,11 @@ def make_scratch(calibration_size: int, column: Index) -> Scratch:
             used[count], columns[count] = j, column[j]
             count += 1
     H, F = np.zeros((MOST, MOTION + calibration_size)), np.zeros((MOTION, MOTION))
-    state = np.empty((3, 3)), np.empty((2, 3)), np.empty(3), np.empty((4, 3)), F, np.empty(KNOT), np.empty((4, 3, 3))
+    there = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty((4, 3))
     work = np.empty((PREDICT_WORK, 3, 3)), np.empty((PROPAGATE_WORK, 3, 3))
-    estimated = used[:count].copy(), columns[:count].copy()
-    return Scratch(np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST)), *state, *work, *estimated, np.empty((0, 0)))
+    late, estimated = (np.empty(KNOT), np.empty((4, 3, 3))), (used[:count].copy(), columns[:count].copy())
+    own = np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST))
+    return Scratch(*own, *there, F, *late, *work, *estimated, np.empty((0, 0)))
 
 
 @helper
@@ -181,7 +174,7 @@ def _interpolate(window: Array, late: float, motion_out: Array, slope_out: Array
 
 
 @view_helper
-def place(state: Keyframe, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> bool:
+def place(state: Epoch, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> bool:
     """The state at a measurement's own time, and the rate there, in ``scratch``; False = it is the keyframe's.
 
     On request with their derivatives by the keyframe's state, and by how late the stamp is.
@@ -203,17 +196,18 @@ def place(state: Keyframe, one: Measured, gravity: float, derive: bool, scratch:
         dv, dp = own[KNOT_DT + 10 : KNOT_DT + 13], own[KNOT_DT + 13 : KNOT_DT + 16]
         for i in range(3):
             scratch.rate[i] = own[KNOT_RATE + i]
-    p, v, motion, assumed = scratch.there[0], scratch.there[1], scratch.moving, row[ASSUMED : ASSUMED + 6]
-    propagate(state.R, state.p, state.v, bias, dt, dR, dv, dp, assumed, gravity, scratch.R, p, v, motion)
+    assumed, seen = row[ASSUMED : ASSUMED + 6], Epoch(state.R, state.p, state.v, bias, state.c)
+    there = Epoch(scratch.R, scratch.p, scratch.v, bias, state.c)
+    propagate(seen, Snapshot(dt, dR, dv, dp, assumed), gravity, there, scratch.moving)
     if derive:
-        propagation_jacobian(state.R, dt, scratch.F, motion)
+        propagation_jacobian(state.R, dt, scratch.F, scratch.moving)
         if late:
             _by_offset(state, dt, assumed, gravity, scratch)
     return True
 
 
 @view_helper
-def _by_offset(state: Keyframe, dt: float, assumed: Array, gravity: float, scratch: Scratch) -> None:
+def _by_offset(state: Epoch, dt: float, assumed: Array, gravity: float, scratch: Scratch) -> None:
     """From slopes of the motion to those of the state, as `Scratch.by_offset` has them, in place."""
     slope, turn, back = scratch.by_offset, scratch.placing[0, 0], scratch.placing[1]
     moved, seen = scratch.placing[2], scratch.placing[3, 0]
@@ -239,7 +233,7 @@ def _by_offset(state: Keyframe, dt: float, assumed: Array, gravity: float, scrat
 
 
 @view_helper
-def innovate(state: Keyframe, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> None:
+def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> None:
     """Innovation and square-root information, and on request the derivative of the prediction, in ``scratch``."""
     row, sensor = one.row, one.sensor
     kind, dim = int(sensor[KIND]), int(sensor[DIM])
@@ -249,9 +243,10 @@ def innovate(state: Keyframe, one: Measured, gravity: float, derive: bool, scrat
             H[a, j] = 0.0
         for j in scratch.used:
             H[a, j] = 0.0
-    params, work, c = sensor[PARAMS:], scratch.predicting, state.c
+    params, work = sensor[PARAMS:], scratch.predicting
     if place(state, one, gravity, derive, scratch):
-        predict(kind, scratch.R, scratch.there[0], scratch.there[1], scratch.bias, c, scratch.rate, params, z, H, work)
+        there = Epoch(scratch.R, scratch.p, scratch.v, scratch.bias, state.c)
+        predict(kind, there, scratch.rate, params, z, H, work)
         if derive:
             if len(one.window):
                 offset = MOTION + int(sensor[OFFSET])
@@ -263,7 +258,8 @@ def innovate(state: Keyframe, one: Measured, gravity: float, derive: bool, scrat
                         H[a, offset] -= H[a, GYR_BIAS + i] * by[3, i]  # the rate enters less its bias
             chain(H, scratch.F)
     else:
-        predict(kind, state.R, state.p, state.v, scratch.bias, c, scratch.rate, params, z, H, work)
+        seen = Epoch(state.R, state.p, state.v, scratch.bias, state.c)
+        predict(kind, seen, scratch.rate, params, z, H, work)
     if derive:
         for a in range(dim):
             for k in range(len(one.scale)):
@@ -278,7 +274,7 @@ def innovate(state: Keyframe, one: Measured, gravity: float, derive: bool, scrat
 
 
 @view_helper
-def squared_length(state: Keyframe, one: Measured, gravity: float, scratch: Scratch) -> float:
+def squared_length(state: Epoch, one: Measured, gravity: float, scratch: Scratch) -> float:
     """Squared length of the whitened innovation."""
     innovate(state, one, gravity, False, scratch)
     square = 0.0
@@ -292,7 +288,7 @@ def squared_length(state: Keyframe, one: Measured, gravity: float, scratch: Scra
 
 @view_helper
 def linearize_measurement(
-    state: Keyframe, one: Measured, gravity: float, scratch: Scratch, r_out: Array, H_out: Array
+    state: Epoch, one: Measured, gravity: float, scratch: Scratch, r_out: Array, H_out: Array
 ) -> float:
     """Whitened innovation of one measurement, its derivative, and its squared length.
 
@@ -310,28 +306,6 @@ def linearize_measurement(
             for k in range(a + 1):
                 H_out[a, own] += W[a, k] * H[k, j]
     return square
-
-
-class States(NamedTuple):
-    """States of n keyframes.
-
-    Attributes
-    ----------
-    R, p, v, b : shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
-    c : calibration vectors, shape (n, C), or (1, C) where nothing walks
-    """
-
-    R: Matrices
-    p: Matrix
-    v: Matrix
-    b: Matrix
-    c: Matrix
-
-
-@helper
-def keyframe(states: States, k: int) -> Keyframe:
-    """One of some states."""
-    return Keyframe(states.R[k], states.p[k], states.v[k], states.b[k], states.c[k if len(states.c) > 1 else 0])
 
 
 @kernel()
@@ -356,7 +330,7 @@ def linearize(
     """
     begin, scratch, derive = 0, make_scratch(states.c.shape[1], column), len(H_out) > 0
     for j in range(len(measured.which)):
-        one, state = pick(measured, j, sensors, scratch), keyframe(states, j if len(states.R) > 1 else 0)
+        one, state = pick(measured, j, sensors, scratch), epoch(states, j if len(states.R) > 1 else 0)
         dim = int(one.sensor[DIM])
         r = r_out[begin : begin + dim]
         if derive:
@@ -398,11 +372,11 @@ def place_measurements(
     """
     scratch, derive = make_scratch(states.c.shape[1], np.empty(0, np.int64)), len(F_out) > 0
     for m in range(len(measured.which)):
-        one, state = pick(measured, m, sensors, scratch), keyframe(states, m)
+        one, state = pick(measured, m, sensors, scratch), epoch(states, m)
         moved = place(state, one, gravity, derive, scratch)
         for i in range(3):
-            out.p[m, i] = scratch.there[0, i] if moved else state.p[i]
-            out.v[m, i] = scratch.there[1, i] if moved else state.v[i]
+            out.p[m, i] = scratch.p[i] if moved else state.p[i]
+            out.v[m, i] = scratch.v[i] if moved else state.v[i]
             rate_out[m, i] = scratch.rate[i]
             for j in range(3):
                 out.R[m, i, j] = scratch.R[i, j] if moved else state.R[i, j]

@@ -20,11 +20,10 @@ WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
 TILT            z = roll and pitch of R_nb
 ==============  =========================================================  ==================
 
-Arguments of `predict`, in the order of `rovgraph.kernels.layout`:
+Arguments of `predict`:
 
-    R, p, v    shapes (3, 3), (3,), (3,): R_nb, position and velocity over ground in n [m, m/s]
-    b          shape (6,), biases of accelerometer and gyro, in b [m/s^2, rad/s]
-    c          calibration vector; of PLACE_OFFSET, north and east of the place follow it and are its last two
+    state      calibration vector and all; of PLACE_OFFSET, north and east of the place follow that vector and are its
+               last two
     rate       shape (3,), measured angular rate in b, its bias still in it [rad/s]
     params     the model's own numbers, as ``packed`` of each model in `rovgraph.sensors` says
     z_out      shape (dim,)
@@ -45,11 +44,10 @@ at first can be used again and again:
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import compass, dvl_mount, magnetometer, tilt
-from rovgraph.kernels.compile import given, kernel, view_helper
+from rovgraph.kernels.compile import Index, Matrices, Matrix, kernel, view_helper
 from rovgraph.kernels.layout import (
     BOTTOM_VELOCITY,
     CURRENT,
@@ -63,8 +61,8 @@ from rovgraph.kernels.layout import (
     VELOCITY,
 )
 from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
+from rovgraph.kernels.states import Epoch, States
 
-Indices = NDArray[np.int64]
 DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY, TILT = range(9)
 WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
 
@@ -77,18 +75,10 @@ def is_angular(kind: int) -> bool:
 
 @view_helper
 def dvl_velocity(
-    R: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    rate: Array,
-    params: Array,
-    water: bool,
-    z_out: Array,
-    H_out: Array,
-    work: Array,
+    state: Epoch, rate: Array, params: Array, water: bool, z_out: Array, H_out: Array, work: Array
 ) -> None:
     """Velocity of the DVL in its own axes, over ground or relative to the water."""
+    R, v, b, c = state.R, state.v, state.b, state.c
     R_bs, axes = work[0], work[1]
     body, w, arm, v_b, row, turn = work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1], work[3, 2]
     dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], R_bs, axes)
@@ -175,22 +165,11 @@ def water_velocity(R: Array, c: Array, z_out: Array, H_out: Array) -> None:
 
 
 @view_helper
-def predict(
-    kind: int,
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    rate: Array,
-    params: Array,
-    z_out: Array,
-    H_out: Array,
-    work: Array,
-) -> None:
+def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H_out: Array, work: Array) -> None:
     """The measurement that a state predicts, and its derivatives; ``work`` has shape (WORK, 3, 3)."""
+    R, p, c = state.R, state.p, state.c
     if kind in (DVL, DVL_WATER):
-        dvl_velocity(R, v, b, c, rate, params, kind == DVL_WATER, z_out, H_out, work)
+        dvl_velocity(state, rate, params, kind == DVL_WATER, z_out, H_out, work)
     elif kind in (DVL_COMPASS, COMPASS):
         compass(R, c, params, kind == DVL_COMPASS, z_out, H_out, work)
     elif kind == MAGNETOMETER:
@@ -205,63 +184,23 @@ def predict(
         tilt(R, z_out, H_out)
 
 
-@view_helper
-def _predict_rows(
-    kind: int,
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    rate: Array,
-    params: Array,
-    columns: Indices,
-    z_out: Array,
-    H_out: Array,
-    own_R: Array,
-    own: Array,
-    own_H: Array,
-    work: Array,
-) -> None:
-    """The loop of `predict_many`, with its own copies, shapes (3, 3) and (4, 6), of what may be strided."""
-    # a row that stands for all epochs stays
-    of_R, of_p, of_v, of_b = len(R) > 1, len(p) > 1, len(v) > 1, len(b) > 1
-    of_c, of_rate, of_params = len(c) > 1, len(rate) > 1, len(params) > 1
-    for k in range(len(z_out)):
-        for i in range(3):
-            own[0, i], own[1, i], own[2, i] = p[k * of_p, i], v[k * of_v, i], rate[k * of_rate, i]
-            own[3, i], own[3, 3 + i] = b[k * of_b, i], b[k * of_b, 3 + i]
-            for j in range(3):
-                own_R[i, j] = R[k * of_R, i, j]
-        own_c, own_params = c[k * of_c], params[k * of_params]
-        predict(kind, own_R, own[0], own[1], own[3], own_c, own[2], own_params, z_out[k], own_H, work)
-        for i in range(len(own_H)):
-            for j in range(len(columns)):
-                H_out[k, i, j] = own_H[i, columns[j]]
-
-
-@kernel(
-    f"void(i8, {given(3)}, {given(2)}, {given(2)}, {given(2)}, f8[:, ::1], {given(2)}, f8[:, ::1], i8[::1], "
-    "f8[:, ::1], f8[:, :, ::1])"
-)
+@kernel()
 def predict_many(
-    kind: int,
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    rate: Array,
-    params: Array,
-    columns: Indices,
-    z_out: Array,
-    H_out: Array,
+    kind: int, states: States, rate: Matrix, params: Matrix, columns: Index, z_out: Matrix, H_out: Matrices
 ) -> None:
-    """`predict` of n epochs: every argument with the epochs in front, or with one row for all of them.
+    """`predict` of n epochs: every array with the epochs in front, or with one row for all of them.
 
     Of the Jacobians ``H_out``, shape (n, dim, len(columns)), has some ``columns``: over a long dive all of them
     would be mostly zeros.
     """
-    own_R, own, work = np.empty((3, 3)), np.empty((4, 6)), np.empty((WORK, 3, 3))
-    own_H = np.zeros((z_out.shape[1], MOTION + c.shape[1]))
-    _predict_rows(kind, R, p, v, b, c, rate, params, columns, z_out, H_out, own_R, own, own_H, work)
+    R, p, v, b, c = states
+    H, work = np.zeros((z_out.shape[1], MOTION + c.shape[1])), np.empty((WORK, 3, 3))
+    # a row that stands for all epochs stays
+    of_R, of_p, of_v, of_b = len(R) > 1, len(p) > 1, len(v) > 1, len(b) > 1
+    of_c, of_rate, of_params = len(c) > 1, len(rate) > 1, len(params) > 1
+    for k in range(len(z_out)):
+        state = Epoch(R[k * of_R], p[k * of_p], v[k * of_v], b[k * of_b], c[k * of_c])
+        predict(kind, state, rate[k * of_rate], params[k * of_params], z_out[k], H, work)
+        for i in range(len(H)):
+            for j in range(len(columns)):
+                H_out[k, i, j] = H[i, columns[j]]

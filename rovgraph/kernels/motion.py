@@ -10,8 +10,9 @@ is turned back by Exp(-t w), and gravity turns meanwhile. Equal to GTSAM's ``Pre
 Intervals without samples for longer than `LONGEST_BRIDGED_S` are coasted through (`rovgraph.kernels.coasting`), those
 of a dive without an IMU are cruised (`rovgraph.kernels.cruising`).
 
-Motions are rows of `rovgraph.kernels.motion_row`. States are R_nb, p_n, v_n and the bias that is seen: with errors
-k of the IMU's scale, b + S k. Derivatives are by rotation, position (in body axes), velocity (in n), bias.
+Motions are rows of `rovgraph.kernels.motion_row`. The bias of a state is that which is seen; of one that comes out
+only attitude, position and velocity are written. Derivatives are by rotation, position (in body axes), velocity (in n),
+bias.
 """
 
 import math
@@ -21,9 +22,9 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coast, coasting_transition
-from rovgraph.kernels.compile import helper, kernel, view_helper
+from rovgraph.kernels.compile import Matrices, Matrix, helper, kernel, view_helper
 from rovgraph.kernels.cruising import cruise, cruising_transition
-from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GAP, GRAVITY, NO_IMU, TANGENT
+from rovgraph.kernels.motion_row import BIAS, BY_BIAS, DURATION, EARTH_RATE, GAP, GRAVITY, NO_IMU, TANGENT
 from rovgraph.kernels.rotations import (
     cross,
     dot,
@@ -33,6 +34,7 @@ from rovgraph.kernels.rotations import (
     rotate,
     skew,
 )
+from rovgraph.kernels.states import Epoch, States, epoch
 
 LONGEST_BRIDGED_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
 
@@ -115,10 +117,9 @@ def _turning(row: Array) -> bool:
 
 
 @view_helper
-def _predict(
-    row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array, scratch: MotionScratch
-) -> None:
+def _predict(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
     """The state after the motion ``zeta`` of the scratch, whose ``turn`` and ``E`` it makes."""
+    R, p, v, R_out, p_out, v_out = state.R, state.p, state.v, out.R, out.p, out.v
     t, zeta, turn, E = row[DURATION], scratch.zeta, scratch.turn, scratch.E
     exp_rotation(zeta, turn)
     for i in range(3):
@@ -153,26 +154,16 @@ def _predict(
 
 
 @view_helper
-def predict_with_jacobian(
-    row: Array,
-    R: Array,
-    p: Array,
-    v: Array,
-    bias: Array,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    scratch: MotionScratch,
-) -> None:
+def predict_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
     """The state after an interval, and how it depends on that before it.
 
     J of the scratch becomes the turn of the body, position and velocity in n by rotation, position, velocity, bias.
     """
     zeta, t, turn, Jr = scratch.zeta, row[DURATION], scratch.turn, scratch.matrices[0]
     E, ER, J_out = scratch.E, scratch.ER, scratch.J
-    correct_motion(row, bias, zeta)
-    _predict(row, R, p, v, R_out, p_out, v_out, scratch)
-    multiply(E, R, ER)
+    correct_motion(row, state.b, zeta)
+    _predict(row, state, out, scratch)
+    multiply(E, state.R, ER)
     right_jacobian(zeta, Jr)
     for i in range(3):
         for j in range(3):
@@ -192,7 +183,7 @@ def predict_with_jacobian(
             at += 18
             J_out[6 + i, 9 + j] = ER[i, 0] * row[at] + ER[i, 1] * row[at + 6] + ER[i, 2] * row[at + 12]
     if _turning(row):
-        _add_turning(row, R, scratch)
+        _add_turning(row, state.R, scratch)
 
 
 @view_helper
@@ -213,34 +204,15 @@ def _add_turning(row: Array, R: Array, scratch: MotionScratch) -> None:
 
 
 @view_helper
-def predict_motion(
-    row: Array,
-    R: Array,
-    p: Array,
-    v: Array,
-    bias: Array,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    scratch: MotionScratch,
-) -> None:
+def predict_motion(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
     """The state at the end of one interval that is not coasted through, without derivatives."""
-    correct_motion(row, bias, scratch.zeta)
-    _predict(row, R, p, v, R_out, p_out, v_out, scratch)
+    correct_motion(row, state.b, scratch.zeta)
+    _predict(row, state, out, scratch)
 
 
 @helper
 def predict_with_transition(
-    row: Array,
-    R: Array,
-    p: Array,
-    v: Array,
-    bias: Array,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    F_out: Array,
-    Q_out: Array,
+    row: Array, covariance: Array, state: Epoch, out: Epoch, F_out: Array, Q_out: Array
 ) -> None:
     """The state at the end of one interval; its error's transition and process noise, shape (15, 15).
 
@@ -249,19 +221,19 @@ def predict_with_transition(
     Q = cov w without an inverse.
     """
     if is_cruising(row):
-        cruise(row, R, p, v, R_out, p_out, v_out)
-        cruising_transition(row, R, v, F_out, Q_out)
+        cruise(row, state, out)
+        cruising_transition(row, state.R, state.v, F_out, Q_out)
         return
     if is_coasted(row):
-        coast(row, R, p, v, R_out, p_out, v_out)
-        coasting_transition(row, R, R_out, F_out, Q_out)
+        coast(row, state, out)
+        coasting_transition(row, state.R, out.R, F_out, Q_out)
         return
     scratch = make_motion_scratch()
-    J = scratch.J
-    predict_with_jacobian(row, R, p, v, bias, R_out, p_out, v_out, scratch)
+    J, R_out = scratch.J, out.R
+    predict_with_jacobian(row, state, out, scratch)
     for i in range(15):
         for j in range(15):
-            F_out[i, j], Q_out[i, j] = 0.0, row[COVARIANCE + 15 * i + j]
+            F_out[i, j], Q_out[i, j] = 0.0, covariance[i, j]
         F_out[i, i] = 1.0
     for j in range(15):
         x, y, z = Q_out[6, j], Q_out[7, j], Q_out[8, j]
@@ -275,30 +247,18 @@ def predict_with_transition(
             Q_out[j, 6 + i] = R_out[i, 0] * x + R_out[i, 1] * y + R_out[i, 2] * z
 
 
-@kernel(
-    "void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1],"
-    " f8[:, :, ::1], f8[:, :, ::1])"
-)
+@kernel()
 def transitions(
-    motions: Array,
-    R: Array,
-    p: Array,
-    v: Array,
-    bias: Array,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    F_out: Array,
-    Q_out: Array,
+    motions: Matrix, covariances: Matrices, states: States, out: States, F_out: Matrices, Q_out: Matrices
 ) -> None:
     """The states at the ends of n intervals, and how errors get there.
 
     Parameters
     ----------
-    motions : ndarray, shape (n, ROW)
-    R, p, v, bias : ndarray, shapes (n, 3, 3), (n, 3), (n, 3), (n, 6), at their beginnings
-    R_out, p_out, v_out : the same at their ends
+    motions, covariances : ndarray, shapes (n, ROW), (n, 15, 15)
+    states, out : at their beginnings, and at their ends
     F_out, Q_out : ndarray, shape (n, 15, 15), transitions and process noise
     """
     for k in range(len(motions)):
-        predict_with_transition(motions[k], R[k], p[k], v[k], bias[k], R_out[k], p_out[k], v_out[k], F_out[k], Q_out[k])
+        state, there = epoch(states, k), epoch(out, k)
+        predict_with_transition(motions[k], covariances[k], state, there, F_out[k], Q_out[k])

@@ -16,7 +16,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coasting_covariance, coasting_error
-from rovgraph.kernels.compile import helper, kernel, view_helper
+from rovgraph.kernels.compile import Matrices, Matrix, helper, kernel, view_helper
 from rovgraph.kernels.cruising import cruising_covariance, cruising_error
 from rovgraph.kernels.layout import ACC_BIAS
 from rovgraph.kernels.motion import (
@@ -27,7 +27,7 @@ from rovgraph.kernels.motion import (
     predict_motion,
     predict_with_jacobian,
 )
-from rovgraph.kernels.motion_row import AFTER, COVARIANCE, RESIDUAL, WIDTH
+from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
 from rovgraph.kernels.rotations import (
     inverse_jacobian_with_slope,
     inverse_right_jacobian,
@@ -35,6 +35,7 @@ from rovgraph.kernels.rotations import (
     multiply_transposed,
     rotate_back,
 )
+from rovgraph.kernels.states import Epoch, States, epoch, with_bias
 
 BIASES = ACC_BIAS  # components of a residual from there on are changes of bias
 
@@ -45,14 +46,13 @@ class ResidualScratch(NamedTuple):
     Attributes
     ----------
     motion : of `rovgraph.kernels.motion`
-    R, away : shapes (3, 3), (2, 3), the predicted attitude, and how far the state after is from what is predicted
+    there : the predicted state; its position and velocity become how far those after are from them
     apart, phi, Jr : shapes (3, 3), (3,), (3, 3), the rotation between them, its logarithm and Jr(phi)^-1
     seen, Jl, slope, back : shapes (3,), (3, 3), (3, 3), (3, 3), of one of the linear errors
     """
 
     motion: MotionScratch
-    R: Array
-    away: Array
+    there: Epoch
     apart: Array
     phi: Array
     Jr: Array
@@ -65,70 +65,47 @@ class ResidualScratch(NamedTuple):
 @helper
 def make_residual_scratch() -> ResidualScratch:
     """Arrays for all motions of a dive; made once."""
-    ends = np.empty((3, 3)), np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    return ResidualScratch(
-        make_motion_scratch(), *ends, np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    )
+    there = Epoch(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(6), np.empty(0))
+    own = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    return ResidualScratch(make_motion_scratch(), there, *own, np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)))
 
 
 @helper
-def motion_error(
-    row: Array,
-    R_i: Array,
-    p_i: Array,
-    v_i: Array,
-    bias_i: Array,
-    R_j: Array,
-    p_j: Array,
-    v_j: Array,
-    bias_j: Array,
-    A_out: Array,
-    scratch: ResidualScratch,
-) -> None:
+def motion_error(row: Array, before: Epoch, after: Epoch, A_out: Array, scratch: ResidualScratch) -> None:
     """Residual of one interval and its derivatives by both states, shape (15, WIDTH)."""
     for i in range(15):
         for j in range(WIDTH):
             A_out[i, j] = 0.0
     if is_cruising(row):
-        cruising_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out)
+        cruising_error(row, before, after, A_out)
     elif is_coasted(row):
-        coasting_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out)
+        coasting_error(row, before, after, A_out)
     else:
-        _inertial_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out, scratch)
+        _inertial_error(row, before, after, A_out, scratch)
 
 
 @view_helper
-def _inertial_error(
-    row: Array,
-    R_i: Array,
-    p_i: Array,
-    v_i: Array,
-    bias_i: Array,
-    R_j: Array,
-    p_j: Array,
-    v_j: Array,
-    bias_j: Array,
-    A_out: Array,
-    scratch: ResidualScratch,
-) -> None:
+def _inertial_error(row: Array, before: Epoch, after: Epoch, A_out: Array, scratch: ResidualScratch) -> None:
     """`motion_error` of an interval with samples; ``A_out`` was zero."""
-    R, away, apart, phi, Jr = scratch.R, scratch.away, scratch.apart, scratch.phi, scratch.Jr
-    predict_with_jacobian(row, R_i, p_i, v_i, bias_i, R, away[0], away[1], scratch.motion)
-    multiply_transposed(R_j, R, apart)
+    there, apart, phi, Jr, R_j = scratch.there, scratch.apart, scratch.phi, scratch.Jr, after.R
+    predict_with_jacobian(row, before, there, scratch.motion)
+    multiply_transposed(R_j, there.R, apart)
     log_rotation(apart, phi)
     inverse_right_jacobian(phi, Jr)
     J = scratch.motion.J
     for i in range(6):
-        A_out[9 + i, RESIDUAL] = bias_i[i] - bias_j[i]
+        A_out[9 + i, RESIDUAL] = before.b[i] - after.b[i]
         A_out[9 + i, 9 + i], A_out[9 + i, AFTER + 9 + i] = 1.0, -1.0
     for i in range(3):
-        A_out[i, RESIDUAL], away[0, i], away[1, i] = phi[i], away[0, i] - p_j[i], away[1, i] - v_j[i]
+        A_out[i, RESIDUAL] = phi[i]
+        there.p[i] -= after.p[i]
+        there.v[i] -= after.v[i]
         for j in range(15):
             A_out[i, j] = Jr[i, 0] * J[0, j] + Jr[i, 1] * J[1, j] + Jr[i, 2] * J[2, j]
         for j in range(3):
             A_out[i, AFTER + j] = -Jr[j, i]  # Jl^-1 is Jr^-1 transposed
-    _linear_error(3, away[0], R_j, A_out, scratch)
-    _linear_error(6, away[1], R_j, A_out, scratch)
+    _linear_error(3, there.p, R_j, A_out, scratch)
+    _linear_error(6, there.v, R_j, A_out, scratch)
     for i in range(3):  # position is perturbed in body axes
         x, y, z = A_out[3 + i, AFTER + 3], A_out[3 + i, AFTER + 4], A_out[3 + i, AFTER + 5]
         for j in range(3):
@@ -210,8 +187,8 @@ def whiten_motion(W: Array, A: Array, A_out: Array) -> None:
 
 
 @helper
-def motion_covariance(row: Array, S_out: Array) -> None:
-    """Covariance of the residual of one interval, shape (15, 15)."""
+def motion_covariance(row: Array, covariance: Array, S_out: Array) -> None:
+    """Covariance of the residual of one interval, shape (15, 15); ``covariance`` is that of its samples."""
     if is_cruising(row):
         cruising_covariance(row, S_out)
         return
@@ -220,45 +197,45 @@ def motion_covariance(row: Array, S_out: Array) -> None:
         return
     for i in range(15):
         for j in range(15):
-            S_out[i, j] = row[COVARIANCE + 15 * i + j]
+            S_out[i, j] = covariance[i, j]
 
 
-@kernel("void(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
-def motion_residuals(
-    motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Array, shift: Array, r_out: Array
-) -> None:
+@kernel()
+def motion_residuals(motions: Matrix, W: Matrices, states: States, shift: Matrix, r_out: Matrix) -> None:
     """Whitened residuals between n keyframes in a row, without derivatives.
 
     Parameters
     ----------
     motions, W : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), the latter of `motion_weights`
-    R, p, v, bias : ndarray, shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
+    states : of the keyframes
     shift : ndarray, shape (n - 1, 6), bias that errors of the IMU's scale make in each interval, or (0, 6)
     r_out : ndarray, shape (n - 1, 15)
     """
-    R_end, p_end, v_end, apart, seen = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    r, b_i, b_j, Jr, A = np.empty(15), np.empty(6), np.empty(6), np.empty((3, 3)), np.empty((15, WIDTH))
+    r, b_i, b_j, A = np.empty(15), np.empty(6), np.empty(6), np.empty((15, WIDTH))
     scratch = make_residual_scratch()
+    there, apart, seen, Jr = scratch.there, scratch.apart, scratch.seen, scratch.Jr
     for k in range(len(motions)):
+        before, after = epoch(states, k), epoch(states, k + 1)
         for i in range(6):
             own = shift[k, i] if len(shift) else 0.0
-            b_i[i], b_j[i] = bias[k, i] + own, bias[k + 1, i] + own
+            b_i[i], b_j[i] = before.b[i] + own, after.b[i] + own
             r[9 + i] = b_i[i] - b_j[i]
+        before, after = with_bias(before, b_i), with_bias(after, b_j)
         if is_coasted(motions[k]):
-            motion_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, A, scratch)
+            motion_error(motions[k], before, after, A, scratch)
             for i in range(15):
                 r[i] = A[i, RESIDUAL]
         else:
-            predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end, scratch.motion)
-            multiply_transposed(R[k + 1], R_end, apart)
+            predict_motion(motions[k], before, there, scratch.motion)
+            multiply_transposed(after.R, there.R, apart)
             log_rotation(apart, r[0:3])
             inverse_right_jacobian(r[0:3], Jr)
             for i in range(3):
-                p_end[i] -= p[k + 1, i]
-                v_end[i] -= v[k + 1, i]
-            rotate_back(R[k + 1], p_end, seen)
+                there.p[i] -= after.p[i]
+                there.v[i] -= after.v[i]
+            rotate_back(after.R, there.p, seen)
             rotate_back(Jr, seen, r[3:6])  # Jl^-1 is Jr^-1 transposed
-            rotate_back(R[k + 1], v_end, seen)
+            rotate_back(after.R, there.v, seen)
             rotate_back(Jr, seen, r[6:9])
         for i in range(15):
             total = 0.0
@@ -267,33 +244,18 @@ def motion_residuals(
             r_out[k, i] = total
 
 
-@kernel(
-    "void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1],"
-    " f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])"
-)
+@kernel()
 def motion_errors(
-    motions: Array,
-    R_i: Array,
-    p_i: Array,
-    v_i: Array,
-    bias_i: Array,
-    R_j: Array,
-    p_j: Array,
-    v_j: Array,
-    bias_j: Array,
-    r_out: Array,
-    A_i_out: Array,
-    A_j_out: Array,
+    motions: Matrix, before: States, after: States, r_out: Matrix, A_i_out: Matrices, A_j_out: Matrices
 ) -> None:
     """Residuals of n intervals, shape (n, 15), and their derivatives by the states at both ends, (n, 15, 15).
 
-    For the keyframes of a dive in a row these are ``R[:-1]`` and ``R[1:]`` and so on. The derivative by errors of
+    For the keyframes of a dive in a row these have ``R[:-1]`` and ``R[1:]`` and so on. The derivative by errors of
     the IMU's scale is that by the bias before, rows 0 to 8, times S.
     """
     scratch, A = make_residual_scratch(), np.empty((15, WIDTH))
     for k in range(len(motions)):
-        before = R_i[k], p_i[k], v_i[k], bias_i[k]
-        motion_error(motions[k], *before, R_j[k], p_j[k], v_j[k], bias_j[k], A, scratch)
+        motion_error(motions[k], epoch(before, k), epoch(after, k), A, scratch)
         for i in range(15):
             r_out[k, i] = A[i, RESIDUAL]
             for j in range(15):
@@ -301,18 +263,18 @@ def motion_errors(
 
 
 @helper
-def motion_weight(motion: Array, W_out: Array) -> None:
+def motion_weight(motion: Array, covariance: Array, W_out: Array) -> None:
     """`motion_weights` of one interval, shape (15, 15)."""
     S = np.empty((15, 15))
-    motion_covariance(motion, S)
+    motion_covariance(motion, covariance, S)
     _whitening(S, np.empty((15, 15)), W_out)
 
 
-@kernel("void(f8[:, ::1], f8[:, :, ::1])")
-def motion_weights(motions: Array, W_out: Array) -> None:
-    """W, with W' W the information of each residual, shape (n, 15, 15).
+@kernel()
+def motion_weights(motions: Matrix, covariances: Matrices, W_out: Matrices) -> None:
+    """W, with W' W the information of each residual, shape (n, 15, 15), as ``covariances``.
 
     It whitens biases first, then rotation, position and velocity, so that the rows of biases are those of their walks.
     """
     for k in range(len(motions)):
-        motion_weight(motions[k], W_out[k])
+        motion_weight(motions[k], covariances[k], W_out[k])

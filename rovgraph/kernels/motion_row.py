@@ -9,8 +9,10 @@
 `GRAVITY`            1  [m/s^2]
 `EARTH_RATE`         3  of the Earth in n, zeros where n is taken as inertial [rad/s]
 `BY_BIAS`           54  derivative of zeta by the bias, shape (9, 6)
-`COVARIANCE`       225  of the residual: rotation, position, velocity, biases, shape (15, 15)
 ===============  =====  ========================================================================================
+
+The covariance of its residual (rotation, position, velocity, biases), shape (15, 15), is kept apart: a smoother has the
+square-root information instead.
 
 What a motion says of the states at its ends is an array of shape (15, `WIDTH`): columns of the state before it, the
 residual in column `RESIDUAL`, columns of the state after it from `AFTER` on, and one that stays zero.
@@ -18,8 +20,7 @@ residual in column `RESIDUAL`, columns of the state after it from `AFTER` on, an
 
 import numpy as np
 
-DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, COVARIANCE = 0, 1, 2, 11, 17, 22, 23, 26, 80
-ROW = COVARIANCE + 225
+DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, ROW = 0, 1, 2, 11, 17, 22, 23, 26, 80
 VELOCITY = slice(TANGENT + 6, TANGENT + 9)
 NO_IMU = np.inf  # instead of a gap
 

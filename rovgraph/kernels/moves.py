@@ -7,6 +7,7 @@ from rovgraph.kernels.change_of_basis import change_basis, turn_rows
 from rovgraph.kernels.compile import Matrix, Vector, helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, make_scratch, retract
 from rovgraph.kernels.filter_state import FilterState
+from rovgraph.kernels.states import epoch_in
 
 
 @helper
@@ -17,8 +18,7 @@ def move(known: FilterState, delta: Array, layout: ErrorLayout) -> None:
     scratch, basis = make_scratch(len(layout.seen), len(c)), np.zeros((size, size))
     for i in range(size):
         basis[i, i] = 1.0
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    retract(R, p, v, b, c, delta[0:size], layout, scratch, basis)
+    retract(epoch_in(x, c), delta[0:size], layout, scratch, basis)
     change_basis(P, basis, layout.rows, np.empty((rows, len(P))), np.empty((rows, size + 1), np.int64))
     turn_rows(B, basis, layout.rows, np.empty((rows, B.shape[1])))
 
@@ -35,6 +35,4 @@ def difference(
 ) -> None:
     """The error that leads from a state to another; ``basis_out``, the unit matrix before, takes errors back."""
     scratch = make_scratch(len(layout.seen), len(c))
-    other = (other_x[0:9].reshape(3, 3), other_x[9:12], other_x[12:15], other_x[15:21], other_c)
-    own = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    local(own[0], own[1], own[2], own[3], c, other, layout, scratch, delta_out, basis_out)
+    local(epoch_in(x, c), epoch_in(other_x, other_c), layout, scratch, delta_out, basis_out)

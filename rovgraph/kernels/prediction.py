@@ -19,6 +19,7 @@ from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
+from rovgraph.kernels.states import Epoch, epoch_in, with_bias
 
 MOVED = 9  # components that the motion mixes: rotation, position, velocity; biases and calibration stay
 
@@ -72,13 +73,13 @@ def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
 
 @helper
 def predict_filter(
-    known: FilterState, motion: Array, scale: Array, model: FilterModel, F_out: Array, Q_out: Array
+    known: FilterState, motion: Array, covariance: Array, scale: Array, model: FilterModel, F_out: Array, Q_out: Array
 ) -> None:
     """Carry an estimate over an interval, in place.
 
     Parameters
     ----------
-    motion : row of `rovgraph.kernels.motion_row`
+    motion, covariance : row of `rovgraph.kernels.motion_row`, and that of its residual, shape (15, 15)
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     F_out, Q_out : shape (n, n), transition and noise
     """
@@ -91,10 +92,8 @@ def predict_filter(
             for k in range(6):
                 bias[i] += scale[i, k] * c[ACC_SCALE + k]
     there = np.empty(15)
-    R_out = there[0:9].reshape(3, 3)
-    predict_with_transition(
-        motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, there[9:12], there[12:15], F, Q
-    )
+    out = Epoch(there[0:9].reshape(3, 3), there[9:12], there[12:15], bias, c)
+    predict_with_transition(motion, covariance, with_bias(epoch_in(x, c), bias), out, F, Q)
     for i in range(15):
         x[i] = there[i]
     F_out.fill(0.0)

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GRAVITY, NOISE, TANGENT
+from rovgraph.kernels.compile import Matrix, Vector, helper, kernel
+from rovgraph.kernels.motion_row import BIAS, BY_BIAS, DURATION, EARTH_RATE, GRAVITY, NOISE, TANGENT
 from rovgraph.kernels.rotations import (
     cross,
     exp_and_left_jacobian,
@@ -213,28 +213,29 @@ def _residual_by_motion(zeta: Array, duration: float, row: Array, J_out: Array) 
 
 
 @helper
-def _write_covariance(zeta: Array, X: Array, noise: Array, duration: float, row_out: Array) -> None:
+def _write_covariance(zeta: Array, X: Array, noise: Array, row: Array, S_out: Array) -> None:
     """From the covariance of zeta and the biases to that of the factor's residual: bias before less bias after."""
     J, half = np.zeros((9, 9)), np.empty((15, 9))
-    _residual_by_motion(zeta, duration, row_out, J)
+    _residual_by_motion(zeta, row[DURATION], row, J)
     for i in range(15):
         for j in range(9):
             half[i, j] = 0.0
             for k in range(9):
                 half[i, j] += J[j, k] * X[i, k]
-    for i in range(225):
-        row_out[COVARIANCE + i] = 0.0
+    for i in range(15):
+        for j in range(15):
+            S_out[i, j] = 0.0
     for j in range(9):
         for i in range(j, 9):
             total = 0.0
             for k in range(9):
                 total += J[i, k] * half[k, j]
-            row_out[COVARIANCE + 15 * i + j] = row_out[COVARIANCE + 15 * j + i] = total
+            S_out[i, j] = S_out[j, i] = total
         for i in range(9, 15):
-            row_out[COVARIANCE + 15 * i + j] = row_out[COVARIANCE + 15 * j + i] = -half[i, j]
+            S_out[i, j] = S_out[j, i] = -half[i, j]
     for i in range(9, 15):
         walk = noise[2] if i < 12 else noise[3]
-        row_out[COVARIANCE + 16 * i] = walk * walk * duration
+        S_out[i, i] = walk * walk * row[DURATION]
 
 
 @helper
@@ -248,7 +249,9 @@ def _write_snapshot(duration: float, zeta: Array, R: Array, snapshot_out: Array)
 
 
 @helper
-def integrate(imu: Array, start: float, end: float, stops: Array, row: Array, snapshots_out: Array) -> None:
+def integrate(
+    imu: Array, start: float, end: float, stops: Array, row: Array, S_out: Array, snapshots_out: Array
+) -> None:
     """Integrate the samples of one interval; parameters as of `preintegrate`, of one interval."""
     zeta, X, F, work = np.zeros(9), np.zeros((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
     bias, noise = row[BIAS : BIAS + 6], row[NOISE:GRAVITY]
@@ -269,11 +272,13 @@ def integrate(imu: Array, start: float, end: float, stops: Array, row: Array, sn
         row[TANGENT + i] = zeta[i]
         for j in range(6):
             row[BY_BIAS + 6 * i + j] = X[15 + j, i]
-    _write_covariance(zeta, X, noise, duration, row)
+    _write_covariance(zeta, X, noise, row, S_out)
 
 
-@kernel("void(f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])")
-def preintegrate(imu: Array, start: float, end: float, stops: Array, row_out: Array, snapshots_out: Array) -> None:
+@kernel()
+def preintegrate(
+    imu: Matrix, start: float, end: float, stops: Vector, row_out: Vector, S_out: Matrix, snapshots_out: Matrix
+) -> None:
     """Integrate IMU samples over an interval.
 
     Parameters
@@ -282,10 +287,11 @@ def preintegrate(imu: Array, start: float, end: float, stops: Array, row_out: Ar
     start, end : [s]
     stops : ndarray, shape (k,), times at which a snapshot is wanted, increasing [s]
     row_out : ndarray, shape (ROW,), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
-        them; duration, motion and covariance are written
+        them; duration and motion are written
+    S_out : ndarray, shape (15, 15), covariance of the residual
     snapshots_out : ndarray, shape (k, SNAPSHOT)
     """
-    integrate(imu, start, end, stops, row_out, snapshots_out)
+    integrate(imu, start, end, stops, row_out, S_out, snapshots_out)
 
 
 @kernel("f8[:, ::1](f8[:, ::1], f8, f8[::1], f8, f8[::1])")

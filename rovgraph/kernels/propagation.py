@@ -16,32 +16,32 @@ order of `rovgraph.kernels.layout`, the derivative F of the state at t by that a
 and the biases stay.
 """
 
+from typing import NamedTuple
+
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import view_helper
 from rovgraph.kernels.layout import ACC_BIAS, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.rotations import cross, exp_rotation, multiply, right_jacobian, rotate
+from rovgraph.kernels.states import Epoch
 
 WORK = 4  # matrices (3, 3) that `propagate` needs to calculate with, and leaves to `propagation_jacobian`
 
 
+class Snapshot(NamedTuple):
+    """The IMU's motion from a keyframe to a time ``dt`` after it, and the bias that it assumed, shape (6,)."""
+
+    dt: float
+    dR: Array
+    dv: Array
+    dp: Array
+    assumed: Array
+
+
 @view_helper
-def propagate(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    dt: float,
-    dR: Array,
-    dv: Array,
-    dp: Array,
-    assumed: Array,
-    gravity: float,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    work: Array,
-) -> None:
-    """The state ``dt`` after a keyframe; the motion was integrated with the bias ``assumed``, shape (6,)."""
+def propagate(state: Epoch, motion: Snapshot, gravity: float, out: Epoch, work: Array) -> None:
+    """The state after a motion from a keyframe; attitude, position and velocity are written."""
+    R, p, v, b, R_out, p_out, v_out = state.R, state.p, state.v, state.b, out.R, out.p, out.v
+    dt, dR, dv, dp, assumed = motion.dt, motion.dR, motion.dv, motion.dp, motion.assumed
     turned, corrected_v, corrected_p, turn, correction = work[0], work[1, 0], work[1, 1], work[1, 2], work[2]
     for i in range(3):
         acceleration = b[i] - assumed[i]

@@ -15,15 +15,15 @@ shape (t,), and the components of x that it is a product of, shape (t, 3), -1 = 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import kernel, view_helper
+from rovgraph.kernels.compile import FlagMatrix, Matrices, Matrix, kernel, view_helper
 
 Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @view_helper
@@ -129,21 +129,25 @@ def _whiten(S: Array, W: Array, e: Array) -> bool:
     return True
 
 
-@kernel(
-    "void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], b1[:, ::1],"
-    " f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1])"
-)
+class Innovations(NamedTuple):
+    """One measurement of several filters.
+
+    Attributes
+    ----------
+    residual : shape (filters, m), measured minus predicted
+    H, R : shapes (filters, m, n), (filters, m, m)
+    measured : shape (filters, m); what is not changes nothing
+    """
+
+    residual: Matrix
+    H: Matrices
+    R: Matrices
+    measured: FlagMatrix
+
+
+@kernel()
 def update(
-    x: Array,
-    P: Array,
-    residual: Array,
-    H: Array,
-    R: Array,
-    measured: Mask,
-    x_out: Array,
-    P_out: Array,
-    normalised_out: Array,
-    sd_out: Array,
+    x: Matrix, P: Matrices, found: Innovations, x_out: Matrix, P_out: Matrices, normalised_out: Matrix, sd_out: Matrix
 ) -> None:
     """One measurement; not finite where the innovation's covariance is not positive definite: the filter has diverged.
 
@@ -152,11 +156,9 @@ def update(
     Parameters
     ----------
     x, P : shapes (filters, n), (filters, n, n)
-    residual : shape (filters, m), measured minus predicted
-    H, R : shapes (filters, m, n), (filters, m, m)
-    measured : shape (filters, m)
     normalised_out, sd_out : shape (filters, m), whitened innovation and its sd before
     """
+    residual, H, R, measured = found
     m, n = H.shape[1], H.shape[2]
     S, W, e, row = np.empty((m, m)), np.empty((m, n)), np.empty(m), np.empty((1, n))
     for f in range(len(x)):

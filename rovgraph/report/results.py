@@ -8,7 +8,7 @@ degrees, and says so.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,15 +39,28 @@ def main_first(estimates: Sequence[Estimate]) -> list[Estimate]:
     return sorted(estimates, key=lambda e: _ORDER.index(e.kind) if e.kind in _ORDER else len(_ORDER))
 
 
+class Remarks(NamedTuple):
+    """What is said of a dive beside its estimates.
+
+    Attributes
+    ----------
+    assumptions : what was taken for granted, a sentence each
+    alarms : what the estimates say against themselves, and advice
+    warnings : what was said of the log, a line each
+    """
+
+    assumptions: Sequence[str] = ()
+    alarms: Sequence[Alarm] = ()
+    warnings: Sequence[str] = ()
+
+
 def write_results(
     folder: Path,
     estimates: Sequence[Estimate],
     log: Log,
     config: Config,
-    assumptions: list[str],
     seconds: dict[str, float],
-    alarms: Sequence[Alarm] = (),
-    warnings: Sequence[str] = (),
+    remarks: Remarks,
     frozen: Sequence[FrozenStretch] = (),
 ) -> dict[str, Any]:
     """Write every file of a results folder but the figures and the page.
@@ -57,10 +70,8 @@ def write_results(
     folder : an existing folder, such as `results_folder` yields
     estimates : of one log; the smoothed one leads where there is one
     log, config : what they were made from
-    assumptions : what was taken for granted, a sentence each
     seconds : stage of the work -> wall time [s]
-    alarms : what the estimates say against themselves, and advice
-    warnings : what was said of the log, a line each
+    remarks : what is said of the dive beside them
     frozen : measurements that are none
 
     Returns
@@ -77,8 +88,8 @@ def write_results(
     _write_of_log(folder, estimates[0], log, config, frozen)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
     summary = {
-        **summarise(estimates, log, config, assumptions, seconds, alarms),
-        "warnings": [*warnings],
+        **summarise(estimates, log, config, [*remarks.assumptions], seconds, remarks.alarms),
+        "warnings": [*remarks.warnings],
         "input": input_file(log.source),
         "versions": versions(),
     }

@@ -21,6 +21,7 @@ from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.kernels import measurements as kernels
 from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.states import States
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 
@@ -106,7 +107,8 @@ def evaluate(model: CompiledModel, by_state: tuple[str, ...], state: State, rate
     if not {len(values) for values in given} <= {1, n}:
         raise ValueError(f"{model.sensor}: cannot predict {n} epochs from arrays of {[len(v) for v in given]}")
     z, H = np.empty((n, model.dim)), np.empty((n, model.dim, len(columns)))
-    kernels.predict_many(model.kind, *given, columns, z, H)
+    R, p, v, b, c, rate, packed = (np.require(values, float, ("C", "W")) for values in given)
+    kernels.predict_many(model.kind, States(R, p, v, b, c), rate, packed, columns, z, H)
     return z, {name: H[..., own] for name, own in parts}
 
 

@@ -130,5 +130,5 @@ def _update(
 ) -> tuple[Array, Array, Array, Array]:
     """State and covariance after a measurement, whitened innovation and its sd before."""
     out = np.empty_like(x), np.empty_like(P), np.empty_like(residual), np.empty_like(residual)
-    kernels.update(x, P, residual, H, R, measured, *out)
+    kernels.update(x, P, kernels.Innovations(residual, H, R, measured), *out)
     return out
