@@ -66,7 +66,8 @@ def problem_of(time: Array, motions: Array, covariances: Array) -> Problem:
         names=np.empty(0),
         lags={},
         bias=motions[0, motion_row.BIAS : motion_row.BIAS + 6] if len(motions) else np.zeros(6),
-        samples=lambda first, last: np.empty((0, 7)),
+        imu=np.empty((0, 7)),
+        forgotten=0,
     )
 
 

@@ -238,7 +238,7 @@ def test_block_predicts_at_the_measurements_own_time(sensor):
     of = block.problem.of.copy()
     of[assembly.WINDOW_OF] = -1
     block = replace(block, problem=replace(block.problem, row_scales=np.zeros((0, 6, 6)), of=of, lags={}))
-    rows = block.rows
+    rows = block.problem.rows[block.index]
     dR, dv, dp = rows[:, at.DR : at.DV].reshape(-1, 3, 3), rows[:, at.DV : at.DP], rows[:, at.DP : at.ASSUMED]
     there, _ = propagate(state, Delta(rows[:, at.DT], dR, dv, dp, rows[:, at.ASSUMED : at.Z]), block.gravity)
     expected = block.instrument.model.predict(there, block.rate_b)[0]

@@ -377,13 +377,9 @@ class Assembly:
             d.names[:m],
             {s: lag for s in self.names if (lag := self.time_offsets.lag(s)) is not None},
             self._integration.row[motion_row.BIAS : motion_row.BIAS + 6],
-            self._samples_between,
+            self._table,
+            int(d.counts[at.FORGOTTEN]),
         )
-
-    def _samples_between(self, first: int, last: int) -> Array:
-        """Some of the IMU's, in body axes, shape (m, 7)."""
-        gone = int(self._dive.counts[at.FORGOTTEN])
-        return self._table[first - gone : last - gone]
 
     def ahead(self, time: float, x: Array) -> Problem:
         """The newest keyframe and one at a later time, as far as the IMU goes; beyond that, as if it stood still.

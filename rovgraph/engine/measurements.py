@@ -133,11 +133,6 @@ class Measurements:
     def __len__(self) -> int:
         return len(self.index)
 
-    @cached_property
-    def rows(self) -> Array:
-        """Shape (n, ROW) or wider, of `rovgraph.kernels.measurement_row`."""
-        return self.problem.rows[self.index]
-
     @property
     def keyframe(self) -> Index:
         """That each belongs to, shape (n,)."""
@@ -161,27 +156,27 @@ class Measurements:
     @property
     def time(self) -> Array:
         """Shape (n,) [s]."""
-        return self.rows[:, at.TIME]
+        return np.asarray(self.problem.rows[self.index, at.TIME])
 
     @property
     def z(self) -> Array:
         """Components, shape (n, dim)."""
-        return self.rows[:, at.Z : at.Z + self.instrument.model.dim]
+        return self.problem.z(self.index, self.instrument.model.dim)
 
     @property
     def rate_b(self) -> Array:
         """Measured rate, bias still in it, shape (n, 3) [rad/s]."""
-        return self.rows[:, at.RATE : at.RATE + 3]
+        return self.problem.rows[self.index, at.RATE : at.RATE + 3]
 
     @property
     def rate_sd(self) -> Array:
         """Its noise, shape (n,) [rad/s]."""
-        return self.rows[:, at.RATE_SD]
+        return np.asarray(self.problem.rows[self.index, at.RATE_SD])
 
     @property
     def dt(self) -> Array:
         """Since the keyframe, shape (n,) [s]."""
-        return self.rows[:, at.DT]
+        return np.asarray(self.problem.rows[self.index, at.DT])
 
     @cached_property
     def W(self) -> Array:
@@ -281,7 +276,7 @@ class Measurements:
     def _compiled(self) -> bool:
         return compiled(self.instrument) and PLACE not in self.instrument.model.state
 
-    @cached_property
+    @property
     def _for_kernels(self) -> tuple[MeasuredRows, Array]:
         """The measurements, and their sensor alone."""
         measured = self.problem.measured(self.index)._replace(which=np.zeros(len(self), np.int64))

@@ -3,7 +3,7 @@
 Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter, and whoever looks at what they have found.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -46,7 +46,7 @@ class Problem:
     names : ndarray, shape (m,), of places that are seen
     lags : sensor whose stamps may be late -> time offsets at the knots of its windows [s]
     bias : ndarray, shape (6,), that motions are integrated with
-    samples : from the first to before the last of the IMU's, to them in body axes, shape (k, 7)
+    imu, forgotten : ndarray, shape (k, 7), samples in body axes, and how many there were before them
     doubted : measurements of places where the vehicle cannot have been, by their index
     """
 
@@ -64,7 +64,8 @@ class Problem:
     names: Array
     lags: Mapping[str, Array]
     bias: Array
-    samples: Callable[[int, int], Array]
+    imu: Array
+    forgotten: int
     doubted: frozenset[int] = frozenset()
 
     def __len__(self) -> int:
@@ -112,8 +113,10 @@ class Problem:
         """What the motion to keyframe k was integrated from, shape (s, 8), of `rovgraph.kernels.preintegration`."""
         own = slice(int(self.taken[k - 1]), int(self.taken[k]))
         stops = self.rows[own, measured.TIME][self.keyframe[own] < k]
-        imu = self.samples(*self.keyframes[k, [at.FIRST, at.LAST]].astype(int).tolist())
-        return integrated_steps(imu, self.time[k - 1], stops, self.time[k], np.ascontiguousarray(self.bias))
+        first, last = (self.keyframes[k, [at.FIRST, at.LAST]].astype(int) - self.forgotten).tolist()
+        return integrated_steps(
+            self.imu[first:last], self.time[k - 1], stops, self.time[k], np.ascontiguousarray(self.bias)
+        )
 
     # measurements
 
