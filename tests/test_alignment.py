@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dives import RecordingFilter, attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
-import rovgraph.engine.alignment as alignment
+from rovgraph.engine import alignment
 from rovgraph.engine import filter
 from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
 from rovgraph.engine.filter_step import Gaussian

@@ -15,7 +15,7 @@ from rovgraph.evaluate import read_reference
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
 from rovgraph.simulate.named import require_known
-from rovgraph.studies import compare as library
+from rovgraph.studies import compare as comparisons
 from rovgraph.studies.choices import listed
 from rovgraph.studies.compare import Comparison
 from rovgraph.studies.estimators import select
@@ -120,7 +120,7 @@ def compare(
             raise InputError(f"reference: expected a path or a Trajectory, found {kind_of(reference)}")
         runs = [Recorded(title, Case(prepared(log, config)[0], config, reference))]
     began = time.perf_counter()
-    comparison = library.compare(runs, names, jobs, lambda done: progress("comparing", done))
+    comparison = comparisons.compare(runs, names, jobs, lambda done: progress("comparing", done))
     about["seconds"] = time.perf_counter() - began
     return ComparisonResult(comparison, title, scenario == THESIS, about)
 

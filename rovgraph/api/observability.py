@@ -10,10 +10,10 @@ from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import as_path, collected_warnings
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
-from rovgraph.studies import observability as library
+from rovgraph.studies.observability import observe as observe_calibration
 from rovgraph.studies.choices import goals as read_goals
 from rovgraph.studies.choices import listed, read_known
-from rovgraph.studies.manoeuvres import manoeuvres as chosen
+from rovgraph.studies.manoeuvres import manoeuvres as candidates_of
 from rovgraph.studies.observability import Observability, estimating
 from rovgraph.studies.plan import Known, Plan, Sensors
 from rovgraph.studies.plan import plan as ranked
@@ -119,7 +119,7 @@ def observe(
     config = estimating(given(log, config), estimate)
     with collected_warnings() as texts:
         log, _ = prepared(log, config)
-        seen = library.observe(log, config, estimate, progress)
+        seen = observe_calibration(log, config, estimate, progress)
     about = {"log": log.source, "estimate": [*estimate]}
     return ObservabilityResult(seen, config, (*log.warnings, *texts), about)
 
@@ -152,7 +152,7 @@ def plan(
     InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
     """
     config = estimating(config_or_defaults(config), listed(estimate))
-    candidates = chosen(listed(manoeuvres) or None, duration)
+    candidates = candidates_of(listed(manoeuvres) or None, duration)
     wanted = read_goals(goals)
     before: Known | None
     if isinstance(known, ObservabilityResult):

@@ -7,7 +7,7 @@ from rovgraph.errors import InputError, as_path
 from rovgraph.progress import Progress, no_progress
 from rovgraph.studies import engines
 from rovgraph.studies.misalignment import Tables, chosen, open_results, read_study
-from rovgraph.studies.misalignment import study as library
+from rovgraph.studies.misalignment import study as study_cells
 from rovgraph.studies.misalignment.ledger import kept_so_far
 
 
@@ -53,7 +53,7 @@ def study_misalignment(
     folder = as_path(out, "out")
     results = open_results(folder, plan, resume)
     began = time.perf_counter()
-    tables = library(plan, results, cells, engine, lambda done: progress("making dives", done))
+    tables = study_cells(plan, results, cells, engine, lambda done: progress("making dives", done))
     with kept_so_far(folder):  # its rows are on disk already
         write_study(folder, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
         draw_study(folder, tables)
