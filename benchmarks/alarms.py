@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from online import messages
 
-from rovgraph.config import Config
 from rovgraph.diagnosis import verdict_of
 from rovgraph.dive import smooth
+from rovgraph.lab.misalignment.plan import GRADES
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
+from rovgraph.model.config import Config
 from rovgraph.simulate import NAMES, Choices, Style, Truth, Waves, scenario, simulate, simulated
 from rovgraph.simulate.named import falcon
-from rovgraph.studies.misalignment.vehicle import GRADES
 
 LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))
 SENSORS: dict[str, dict[str, Any]] = {

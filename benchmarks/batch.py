@@ -18,12 +18,12 @@ from tempfile import TemporaryDirectory
 import gtsam
 import numpy as np
 
-from rovgraph.config import Config, beliefs, load_config
-from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble
-from rovgraph.graph.batch import DiveGraph, make_graph, make_values, solve
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.graph.batch import DiveGraph, make_graph, make_values, solve
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import assemble
 from rovgraph.log import read_log
+from rovgraph.model.config import Config, beliefs, load_config
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import write_log
 

@@ -25,10 +25,10 @@ from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import GRADES, Vehicle, configuration, make_vehicle
 from scipy.stats import binomtest
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config
 from rovgraph.dive import smooth
 from rovgraph.log import Log
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config
 
 YAW_SD_DEG, SCALE_SD = 10.0, 0.03  # of the priors: wide, so that the dive decides
 SHOWN = ("dvl_yaw", "dvl_scale")

@@ -20,10 +20,9 @@ import gtsam
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from rovgraph.engine.chain_information import MeasurementRows
-from rovgraph.engine.linear_chain import MotionRows, eliminate
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, skew, transpose
-from rovgraph.graph.marginals import covariances
+from rovgraph.inference.chain_information import MeasurementRows, MotionRows, eliminate
+from rovgraph.inference.graph.optimum import covariances
 
 RATE = 5.6  # keyframes a second
 SAMPLES = 18  # of the IMU between two

@@ -13,10 +13,10 @@ from fault_campaign.campaign import make_dive
 from fault_campaign.cases import CASES, FAULTS, HEALTHY, Case
 from fault_campaign.instruments import log_table
 
-from rovgraph.check import Finding, examine
-from rovgraph.config import Config
+from rovgraph.diagnosis.check import Finding, examine
 from rovgraph.errors import InputError
 from rovgraph.log import Log
+from rovgraph.model.config import Config
 
 
 def log_of_case(case: Case, seed: int) -> tuple[Log, Config]:

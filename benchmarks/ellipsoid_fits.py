@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rovgraph.calibrate.ellipsoid import fit_ellipsoid
 from rovgraph.geometry import Array
+from rovgraph.lab.calibrate.magnetometer import fit_ellipsoid
 
 Fit = Callable[[Array], tuple[Array, Array]]
 

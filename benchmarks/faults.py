@@ -20,7 +20,7 @@ from fault_campaign.campaign import Outcome, run, table, verdicts
 from fault_campaign.cases import CASES, Case
 from fault_campaign.judge import HONEST_NEES, LIE_NEES, WORST_FIRST, honest_nees
 
-from rovgraph.workers import cores
+from rovgraph.lab.executors import cores
 
 PAGE, ONLINE_PAGE = "faults.md", "faults-online.md"  # in docs
 

@@ -9,14 +9,13 @@ import argparse
 
 import numpy as np
 
-from rovgraph.config import Config
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.evaluate import normalised_error
 from rovgraph.geometry import Array
+from rovgraph.inference.estimate import Estimate
+from rovgraph.lab.estimators import ESTIMATORS, EstimatorSpec, outcomes, select
+from rovgraph.lab.evaluate import normalised_error
 from rovgraph.log import Log
+from rovgraph.model.config import Config
 from rovgraph.simulate import Choices, Dive, simulated
-from rovgraph.studies.estimator_chains import EstimatorSpec, outcomes
-from rovgraph.studies.estimators import ESTIMATORS, select
 
 GAP = {"vattern": (120.0, 180.0), "excited": (150.0, 210.0)}  # without bottom lock [s]
 DRAG = ("drag_linear", "drag_quadratic")

@@ -24,17 +24,17 @@ import numpy as np
 import pandas as pd
 from scipy.signal import butter, sosfiltfilt
 
-from rovgraph.config import Config, load_config, mount_matrix
 from rovgraph.dive import smooth
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.evaluate import read_reference
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, rotate, rpy_from_matrix, transpose
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.evaluate import read_reference
+from rovgraph.lab.misalignment.plan import Grade, believed
 from rovgraph.log import Log, Stream, read_log
+from rovgraph.model.config import Config, load_config, mount_matrix
 from rovgraph.simulate import Dive, Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.simulate.named import falcon
-from rovgraph.studies.misalignment.vehicle import Grade, believed
-from rovgraph.trajectory import Trajectory
 
 Row = dict[str, Any]
 ANGLES = ("dvl_roll", "dvl_pitch", "dvl_yaw")

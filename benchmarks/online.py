@@ -16,10 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rovgraph.config import load_config
 from rovgraph.dive import smooth
-from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import log_rotation, transpose
+from rovgraph.lab.evaluate import evaluate, read_reference
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator
@@ -27,6 +26,7 @@ from rovgraph.live.session import RATE_HZ, Session
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, read_log
+from rovgraph.model.config import load_config
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
 

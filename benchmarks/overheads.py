@@ -24,19 +24,18 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.diagnosis import Evidence, statistics
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble, smoothed
-from rovgraph.estimators.thesis import FILTERS, FilterJob, run_filters
-from rovgraph.estimators.thesis.processes import length
-from rovgraph.estimators.thesis.setup import prepare
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import assemble, smoothed
+from rovgraph.lab.thesis import FILTERS, FilterJob, run_filters
+from rovgraph.lab.thesis.processes import length
+from rovgraph.lab.thesis.setup import prepare
 from rovgraph.live.alarms import LiveAlarms
-from rovgraph.live.checkpoint import write_checkpoint
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.feed import Feed
+from rovgraph.live.files import Recorder, write_checkpoint
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator
-from rovgraph.live.recorder import Recorder
+from rovgraph.live.session import Feed
 from rovgraph.live.sources import open_source
 from rovgraph.log import STREAMS, Log, Stream, read_log
 from rovgraph.simulate import Choices, simulated

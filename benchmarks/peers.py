@@ -28,14 +28,14 @@ from fault_campaign.cases import CASES
 from fault_campaign.instruments import log_table
 from scipy.ndimage import median_filter
 
-from rovgraph.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.dive import smooth
-from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import Array, earth_rate_n, matrix_from_rpy, skew, wrap_angle
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.evaluate import evaluate, read_reference
 from rovgraph.log import Log, read_log
+from rovgraph.model.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.simulate import Choices
 from rovgraph.simulate.named import simulated
-from rovgraph.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
 GRADES = {"MTi": "survey", "tactical": "tactical", "FOG": "FOG"}  # cases of the fault campaign

@@ -27,7 +27,7 @@ SAMPLE = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_sm
 sys.path.insert(0, str(TESTS))  # where the writers are
 RATE = 400.0  # of the IMU [Hz]
 WORKS = {
-    "read": "from rovgraph.interchange import read_recording; read_recording({path!r})",
+    "read": "from rovgraph.readers import read_recording; read_recording({path!r})",
     "convert": "import sys; from rovgraph.cli.app import main; sys.argv[1:] = ['convert', {path!r}, '--out', {out!r}]; "
     "main()",
 }

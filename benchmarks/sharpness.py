@@ -35,12 +35,12 @@ from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
 from scipy.stats import chi2
 
-from rovgraph.config import Config
 from rovgraph.dive import smooth
-from rovgraph.estimators import results
 from rovgraph.geometry import rpy_from_matrix
+from rovgraph.inference import estimate as results
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
-from rovgraph.trajectory import Trajectory
+from rovgraph.model.config import Config
 
 UNDER_WAY = "FOG under way, DVL 1 Hz"
 WRONG_S = {"dvl frozen": (80.0, 140.0), "dvl false lock": (90.0, 110.0)}  # when the pings of a case are wrong

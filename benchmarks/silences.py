@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rovgraph.config import Config, load_config
 from rovgraph.dive import smooth
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.estimators.initialise import initialise
-from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import Array, log_rotation, transpose
+from rovgraph.inference.error_state import ErrorStateFilter
+from rovgraph.inference.initialise import initialise
+from rovgraph.lab.evaluate import evaluate, read_reference
 from rovgraph.log import Log, read_log
+from rovgraph.model.config import Config, load_config
 from rovgraph.simulate import Style, Truth, Waves, scenario, simulate
 from rovgraph.simulate.named import falcon
 

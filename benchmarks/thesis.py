@@ -21,19 +21,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.thesis import FILTERS, Filter, run_filter
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.estimators import ESTIMATORS
+from rovgraph.lab.executors import cores, in_workers
+from rovgraph.lab.thesis import FILTERS, Filter, run_filter
 from rovgraph.log import Log, Stream
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.sensors import field_direction
 from rovgraph.simulate import CALM, Choices, Dive, Style, Truth, Waves, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import known
-from rovgraph.simulate.noise import THESIS
-from rovgraph.studies.estimators import ESTIMATORS
-from rovgraph.trajectory import Trajectory
-from rovgraph.workers import cores, in_workers
+from rovgraph.simulate.truth import THESIS
 
 Row = dict[str, Any]
 ANGLES = ("dvl_roll", "dvl_pitch", "dvl_yaw")

@@ -34,11 +34,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api, extend / pages / report, export, web / studies, live / dive, interchange / diagnosis /
-estimators, simulate, evaluate, calibrate / check / graph / engine /
-instruments, rules / log / sensors / config, trajectory / vehicle /
-state, calibration, thesis / kernels / tables / dates / gauss_markov, units, gps_time, stamps /
-geometry, workers, fast_csv, spilling / errors, process, progress.
+cli / rovgraph / api, extend / report, web / live, lab / dive, readers / diagnosis / simulate / inference / problem /
+rules / log / sensors / model / kernels / dates / geometry / errors, process, _version.
 """
 
 import importlib
@@ -46,93 +43,93 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from rovgraph._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from rovgraph.api.calibration import MagnetometerResult as MagnetometerResult
-    from rovgraph.api.calibration import NoiseResult as NoiseResult
-    from rovgraph.api.calibration import calibrate_magnetometer as calibrate_magnetometer
-    from rovgraph.api.calibration import calibrate_noise as calibrate_noise
-    from rovgraph.api.comparison import ComparisonResult as ComparisonResult
-    from rovgraph.api.comparison import compare as compare
     from rovgraph.api.conversion import Conversion as Conversion
+    from rovgraph.api.conversion import Guess as Guess
     from rovgraph.api.conversion import convert as convert
-    from rovgraph.api.demo import Demo as Demo
-    from rovgraph.api.demo import demo as demo
+    from rovgraph.api.conversion import guess_columns as guess_columns
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
-    from rovgraph.api.guessing import Guess as Guess
-    from rovgraph.api.guessing import guess_columns as guess_columns
-    from rovgraph.api.live_page import live_page as live_page
+    from rovgraph.api.lab import ComparisonResult as ComparisonResult
+    from rovgraph.api.lab import MagnetometerResult as MagnetometerResult
+    from rovgraph.api.lab import NoiseResult as NoiseResult
+    from rovgraph.api.lab import ObservabilityResult as ObservabilityResult
+    from rovgraph.api.lab import PlanResult as PlanResult
+    from rovgraph.api.lab import calibrate_magnetometer as calibrate_magnetometer
+    from rovgraph.api.lab import calibrate_noise as calibrate_noise
+    from rovgraph.api.lab import compare as compare
+    from rovgraph.api.lab import observe as observe
+    from rovgraph.api.lab import plan as plan
+    from rovgraph.api.lab import study_misalignment as study_misalignment
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
-    from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
-    from rovgraph.api.observability import PlanResult as PlanResult
-    from rovgraph.api.observability import observe as observe
-    from rovgraph.api.observability import plan as plan
     from rovgraph.api.online import Online as Online
+    from rovgraph.api.online import live_page as live_page
     from rovgraph.api.reporting import report as report
     from rovgraph.api.reporting import report_check as report_check
+    from rovgraph.api.simulation import Demo as Demo
     from rovgraph.api.simulation import SimulatedDive as SimulatedDive
+    from rovgraph.api.simulation import demo as demo
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
     from rovgraph.api.smoothing import smooth as smooth
-    from rovgraph.api.studies import study_misalignment as study_misalignment
-    from rovgraph.config import Config as Config
-    from rovgraph.config import load_config as load_config
-    from rovgraph.config import parse_config as parse_config
     from rovgraph.errors import DataWarning as DataWarning
     from rovgraph.errors import InputError as InputError
-    from rovgraph.evaluate import Metrics as Metrics
-    from rovgraph.evaluate import evaluate as evaluate
-    from rovgraph.evaluate import read_reference as read_reference
+    from rovgraph.inference.trajectory import Trajectory as Trajectory
+    from rovgraph.inference.trajectory import read_trajectory as read_trajectory
+    from rovgraph.lab.evaluate import Metrics as Metrics
+    from rovgraph.lab.evaluate import evaluate as evaluate
+    from rovgraph.lab.evaluate import read_reference as read_reference
     from rovgraph.log import Log as Log
+    from rovgraph.model.config import Config as Config
+    from rovgraph.model.config import load_config as load_config
+    from rovgraph.model.config import parse_config as parse_config
     from rovgraph.simulate import Choices as Choices
-    from rovgraph.trajectory import Trajectory as Trajectory
-    from rovgraph.trajectory import read_trajectory as read_trajectory
 
 # name -> the module it is imported from when it is first used, so that importing the package costs nothing
 _HOMES = {
     "Choices": "simulate",
-    "ComparisonResult": "api.comparison",
-    "Config": "config",
+    "ComparisonResult": "api.lab",
+    "Config": "model.config",
     "Conversion": "api.conversion",
     "DataWarning": "errors",
-    "Demo": "api.demo",
-    "Guess": "api.guessing",
+    "Demo": "api.simulation",
+    "Guess": "api.conversion",
     "InputError": "errors",
     "Log": "log",
-    "MagnetometerResult": "api.calibration",
-    "Metrics": "evaluate",
-    "NoiseResult": "api.calibration",
-    "ObservabilityResult": "api.observability",
+    "MagnetometerResult": "api.lab",
+    "Metrics": "lab.evaluate",
+    "NoiseResult": "api.lab",
+    "ObservabilityResult": "api.lab",
     "Online": "api.online",
-    "PlanResult": "api.observability",
+    "PlanResult": "api.lab",
     "Result": "api.smoothing",
     "SimulatedDive": "api.simulation",
-    "Trajectory": "trajectory",
-    "calibrate_magnetometer": "api.calibration",
-    "calibrate_noise": "api.calibration",
+    "Trajectory": "inference.trajectory",
+    "calibrate_magnetometer": "api.lab",
+    "calibrate_noise": "api.lab",
     "check": "api.logs",
-    "compare": "api.comparison",
+    "compare": "api.lab",
     "convert": "api.conversion",
-    "demo": "api.demo",
-    "evaluate": "evaluate",
+    "demo": "api.simulation",
+    "evaluate": "lab.evaluate",
     "export": "api.exporting",
-    "guess_columns": "api.guessing",
-    "live_page": "api.live_page",
-    "load_config": "config",
-    "observe": "api.observability",
-    "parse_config": "config",
-    "plan": "api.observability",
+    "guess_columns": "api.conversion",
+    "live_page": "api.online",
+    "load_config": "model.config",
+    "observe": "api.lab",
+    "parse_config": "model.config",
+    "plan": "api.lab",
     "read_log": "api.logs",
-    "read_reference": "evaluate",
-    "read_trajectory": "trajectory",
+    "read_reference": "lab.evaluate",
+    "read_trajectory": "inference.trajectory",
     "report": "api.reporting",
     "report_check": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
-    "study_misalignment": "api.studies",
+    "study_misalignment": "api.lab",
     "tag": "api.exporting",
 }
 __all__ = list(_HOMES)

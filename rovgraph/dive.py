@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rovgraph.check import Finding
-from rovgraph.config import Config
 from rovgraph.diagnosis import (
     Alarm,
     Evidence,
@@ -19,35 +17,36 @@ from rovgraph.diagnosis import (
     statistics,
     verdict_of,
 )
+from rovgraph.diagnosis.check import Finding
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
-from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.lasting import Rival
-from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.unknowns import unknowns
-from rovgraph.engine.variance_sources import variance_sources
-from rovgraph.estimators.attitude_gaps import AttitudeGap, without_attitude_gaps
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, assemble, smoothed
+from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.correlated_noise import Rival
+from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.smoother import BatchSmoother, assemble, smoothed
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.inference.variance_sources import variance_sources
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
-from rovgraph.process import stage
-from rovgraph.progress import Progress, no_progress
-from rovgraph.state import State
-from rovgraph.trajectory import Trajectory
+from rovgraph.model.config import Config
+from rovgraph.model.state import State
+from rovgraph.problem.calibration_roles import unknowns
+from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.motion import LONGEST_CRUISED_S
+from rovgraph.process import Progress, no_progress, stage
 
 if TYPE_CHECKING:
-    from rovgraph.estimators.incremental import IncrementalEstimator
+    from rovgraph.inference.graph.isam2 import IncrementalEstimator
 
 
 Search = Callable[[ChainOptimum, Config, Sequence[Alarm]], tuple[list[UnstatedNoise], list[Rival]]]
 
 
 @dataclass(frozen=True)
-class Dive:
+class DiveEstimates:
     """The estimates of a dive.
 
     Attributes
@@ -99,7 +98,7 @@ def smooth(
     estimate: str = "both",
     progress: Progress = no_progress,
     findings: Sequence[Finding] = (),
-) -> Dive:
+) -> DiveEstimates:
     """Estimate a dive: what ``rovgraph smooth`` does.
 
     Parameters
@@ -199,7 +198,7 @@ class _Solver:
             self.before = self.before or self.estimates[0].trajectory
         return bool(found)
 
-    def result(self) -> Dive:
+    def result(self) -> DiveEstimates:
         """The dive, with what brings its variance, and what was found in it."""
         more: dict[str, object] = {}
         if isinstance(self.best, ChainOptimum):
@@ -209,11 +208,11 @@ class _Solver:
         assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
         return replace(self.dive(more), initial=replace(self.initial, assumptions=assumptions))
 
-    def dive(self, more: Mapping[str, object]) -> Dive:
+    def dive(self, more: Mapping[str, object]) -> DiveEstimates:
         """As it is believed to be, with more in the summary of its main estimate."""
         main, *others = self.estimates
         main = replace(main, summary={**main.summary, **more})
-        return Dive([main, *others], self.initial, self.left_out, self.frozen, self.statistics)
+        return DiveEstimates([main, *others], self.initial, self.left_out, self.frozen, self.statistics)
 
 
 def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, object]:
@@ -273,7 +272,7 @@ def _filtered(batch: BatchSmoother, progress: Progress) -> tuple[Estimate, State
 
 def _isam2(batch: BatchSmoother, progress: Progress) -> "IncrementalEstimator":
     """One pass of iSAM2, or two where late stamps were found to belong elsewhere."""
-    from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
+    from rovgraph.inference.graph.isam2 import run_isam2  # GTSAM is slow to load, and not everywhere to be had
 
     progress("incremental smoothing", 0.0)
     report = partial(progress, "incremental smoothing")

@@ -4,15 +4,14 @@ The names below stay as they are within a major version, as those of ``import ro
 internal and may change with any release. docs/own-sensor.md, docs/formats.md and docs/export.md show their use.
 """
 
-from rovgraph.calibration import Variable
-from rovgraph.config import Config, SensorSettings
-from rovgraph.export.formats import ExportFormat
-from rovgraph.export.formats import Options as ExportOptions
-from rovgraph.export.track import Track
 from rovgraph.geometry import Array, rotate, skew
-from rovgraph.interchange.formats import Format
-from rovgraph.interchange.formats import Options as ReadingOptions
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.model.calibration import Variable
+from rovgraph.model.config import Config, SensorSettings
+from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
+from rovgraph.readers.formats import Format, ReadingOptions
+from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.report.export.formats import ExportFormat, ExportOptions
+from rovgraph.report.export.track import Track
 from rovgraph.sensors import (
     Column,
     Instrument,
@@ -25,7 +24,6 @@ from rovgraph.sensors import (
     settings,
     unregister,
 )
-from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 __all__ = [
     "BIAS",

@@ -1,4 +1,7 @@
-"""What a process of rovgraph leaves undone: threads that wait for one another, and looking for garbage."""
+"""What a process of rovgraph leaves undone: threads that wait for one another, and looking for garbage.
+
+How a long task tells how far it is.
+"""
 
 import contextlib
 import ctypes
@@ -22,7 +25,7 @@ ONE_THREAD = dict.fromkeys(
 )
 
 
-def be_frugal() -> None:
+def limit_threads_and_gc() -> None:
     """One thread for each library, unless the environment says otherwise; to be called before NumPy is imported.
 
     The collector of cycles would look at a million objects of a dive again and again, and hardly find any.
@@ -50,3 +53,10 @@ def stage(function: F) -> F:
                     ctypes.CDLL(None).malloc_trim(0)
 
     return cast(F, whole)
+
+
+Progress = Callable[[str, float], None]  # the current task, and how much of it is done, from 0 to 1
+
+
+def no_progress(what: str, done: float) -> None:
+    """Show nothing."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Literal, NamedTuple
 
-from rovgraph.config import Config
 from rovgraph.log.frozen import HOLD
 from rovgraph.log.frozen import SURE as SURE
+from rovgraph.model.config import Config
 
 Severity = Literal["advice", "doubtful", "wrong"]
 

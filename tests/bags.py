@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rovgraph.interchange.rosbag import ALL_DEFINITIONS
+from rovgraph.readers.rosbag import ALL_DEFINITIONS
 
 START = 1_700_000_000.0
 SURFACE, SEA, GRAVITY = 101_325.0, 1025.0, 9.80665

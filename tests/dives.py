@@ -9,18 +9,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.config import Config, beliefs, load_config
-from rovgraph.engine.filter_step import FilterStep, Gaussian
-from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother, assemble
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
+from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.filter_step import FilterStep, Gaussian
+from rovgraph.inference.graph.isam2 import IncrementalEstimator
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import BatchSmoother, assemble
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.model.config import Config, beliefs, load_config
+from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
-from rovgraph.trajectory import Trajectory
 
 FALCON = FilePath(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml"
 LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))

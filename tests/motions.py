@@ -5,10 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rovgraph.calibration import TABLE
-from rovgraph.engine.measurements import kernel_states
-from rovgraph.engine.problem import Problem
-from rovgraph.engine.scale import biased
 from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import measurement_row, motion_row
@@ -16,11 +12,15 @@ from rovgraph.kernels.linearization import place_measurements
 from rovgraph.kernels.motion import transitions
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights
 from rovgraph.kernels.states import States
-from rovgraph.state import State
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.state import State
+from rovgraph.problem.measurements import kernel_states
+from rovgraph.problem.motion import biased
+from rovgraph.problem.problem import Problem
 
 
 def predict(motion: Array, before: State, scale: Array | None = None) -> State:
-    """The state at the end of a motion, shape (ROW,); ``scale``, shape (6, 6), is that of `rovgraph.engine.scale`."""
+    """The state at the end of a motion, shape (ROW,); ``scale``, shape (6, 6), is that of `rovgraph.problem.motion`."""
     return transition(motion, np.zeros((15, 15)), before, scale)[0]
 
 
@@ -78,7 +78,7 @@ def _states(state: State, scale: Array | None = None) -> States:
 
 
 class Delta(NamedTuple):
-    """Motion from n keyframes to measurements: see `rovgraph.kernels.propagation`."""
+    """Motion from n keyframes to measurements: see `rovgraph.kernels.linearization`."""
 
     dt: Array
     dR: Array

@@ -8,8 +8,8 @@ import pytest
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import Options, read_recording
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.readers.formats import ReadingOptions, read_recording
+from rovgraph.readers.recording import Channel, Recording
 from rovgraph.simulate import Choices
 
 
@@ -22,7 +22,7 @@ def read(data: bytes, folder: Path, **choose: str) -> Recording:
     """A file of these bytes, as its format's reader has it."""
     path = folder / "dive.bin"  # content tells what it is, not its name
     path.write_bytes(data)
-    return read_recording(path, Options(choose=choose))
+    return read_recording(path, ReadingOptions(choose=choose))
 
 
 def first(recording: Recording, sensor: str) -> Channel:

@@ -28,17 +28,17 @@ from dives import (
 from test_places import circle
 
 from rovgraph.cli.app import main
-from rovgraph.config import load_config, mount_matrix
 from rovgraph.diagnosis import RULES, Statistic, find_alarms, verdict_of
 from rovgraph.diagnosis.alarm import alarm_of
 from rovgraph.diagnosis.constants import TIME_OFFSETS
-from rovgraph.dive import Dive, smooth
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.released import release
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble
+from rovgraph.dive import DiveEstimates, smooth
 from rovgraph.geometry import rotate, transpose
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.score_test import score_test
+from rovgraph.inference.smoother import assemble
 from rovgraph.log import Log
+from rovgraph.model.config import load_config, mount_matrix
 
 SECONDS = 200.0
 SHIPPED, SHIPPED_S = Path(__file__).parents[1] / "data" / "falcon", 160.0
@@ -64,7 +64,7 @@ NOISE = {  # found in the dive, and believed
 }
 
 
-def broken(name: str, seed: int, path: str = "falcon", find_noise: bool = False) -> tuple[Simulated, Dive]:
+def broken(name: str, seed: int, path: str = "falcon", find_noise: bool = False) -> tuple[Simulated, DiveEstimates]:
     case = simulated(falcon(graph={"find_noise": find_noise}), SECONDS, seed, path, **BROKEN[name].truth)
     return case, smooth(BROKEN[name].breaks(case.log), case.config)
 
@@ -137,7 +137,7 @@ def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
     case = simulated(falcon(), SECONDS, 2, calibration={name: off * np.ones(3 if name == "gyr_scale" else 1)})
     best = assemble(case.log, initialise(case.log, case.config)).optimum()
     assert isinstance(best, ChainOptimum)
-    found = release(best, [name])
+    found = score_test(best, [name])
     mean = case.config.dvl.mount_rpy_deg[1] if name == "dvl_pitch" else 0.0
     assert all(abs(r.step - (off - np.deg2rad(mean))) < 4.0 * r.sd + 0.15 * off for r in found)
     assert max(r.significance for r in found) > 5.0
@@ -164,7 +164,7 @@ def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_rele
     for seed in range(1, 5):
         case = simulated(falcon(), 120.0, seed)
         best = assemble(case.log, initialise(case.log, case.config)).optimum()
-        found = release(best, ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
+        found = score_test(best, ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
         steps += [r.step / r.sd for r in found]
     assert len(steps) == 36
     assert 0.5 < float(np.std(steps)) < 1.6

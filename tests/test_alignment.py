@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from dives import RecordingFilter, attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
-from rovgraph.engine import alignment
-from rovgraph.engine import filter
-from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
-from rovgraph.engine.filter_step import Gaussian
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
+from rovgraph.inference import filter
+from rovgraph.inference import filter as alignment
+from rovgraph.inference.error_state import ErrorStateFilter
+from rovgraph.inference.filter import aligned, poorly_known, with_attitude
+from rovgraph.inference.filter_step import Gaussian
+from rovgraph.inference.initialise import initialise
 
 GRAVITY = 9.81
 

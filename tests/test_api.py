@@ -19,9 +19,9 @@ from folders import same_files
 from typer.main import get_command
 
 import rovgraph as rg
-from rovgraph.api.demo import CHOICES, SCENARIO, SEED
+from rovgraph.api.simulation import CHOICES, SCENARIO, SEED
 from rovgraph.cli.app import app, main
-from rovgraph.studies.plan import Sensors
+from rovgraph.lab.plan import SensorRates
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
 IMU = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
@@ -217,7 +217,7 @@ def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
 
 def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
     """A minute of it; the whole dive is smoothed from the installed wheel."""
-    monkeypatch.setattr("rovgraph.api.demo.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
+    monkeypatch.setattr("rovgraph.api.simulation.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "demo") == 0
     said = capsys.readouterr().out
@@ -338,10 +338,10 @@ def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path, short, co
 
 
 def test_plan_writes_what_the_command_writes(monkeypatch, tmp_path):
-    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything again
+    monkeypatch.setattr("rovgraph.lab.plan.cores", lambda: 1)  # each process imports everything again
     options = ["--manoeuvres", "straight", "--duration", 60, "--imu-rate", 20, "--dvl-rate", 2]
     assert command(monkeypatch, "plan", *options, "--estimate", "dvl_yaw", "-o", tmp_path / "command") == 0
-    sensors = Sensors(20.0, 2.0, None)
+    sensors = SensorRates(20.0, 2.0, None)
     twin = rg.plan(rg.Config(), duration=60.0, manoeuvres=["straight"], estimate=["dvl_yaw"], sensors=sensors)
     twin.save(tmp_path / "twin")
     same_files(tmp_path / "command", tmp_path / "twin")

@@ -10,14 +10,14 @@ from dives import Simulated, falcon, interrupted, kept, level_log, same, simulat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rovgraph.config import Config
-from rovgraph.engine.assembly import Assembly, InsertResult
-from rovgraph.engine.problem import Problem
-from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import UPTO
 from rovgraph.kernels.motion_row import DURATION
 from rovgraph.log import Log
+from rovgraph.model.config import Config
+from rovgraph.problem.assembly import Assembly, InsertResult
+from rovgraph.problem.problem import Problem
+from rovgraph.sensors.instruments import instruments
 
 G = np.array([0.0, 0.0, -9.81])
 

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from rovgraph.config import mount_matrix
 from rovgraph.geometry import signed_permutations
+from rovgraph.model.config import mount_matrix
 from rovgraph.sensors.dvl import VELOCITIES, axes_remedy
 
 MOUNT_RPY_DEG = (180.0, 0.0, 45.0)

@@ -23,17 +23,17 @@ from dives import (
     true_at,
 )
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, beliefs
 from rovgraph.dive import smooth
-from rovgraph.engine import gauss_newton
-from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
-from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.graph.batch import DiveGraph, indeterminate, make_graph, make_values, solve
-from rovgraph.graph.keys import key
-from rovgraph.graph.marginals import covariances, marginals
+from rovgraph.inference import gauss_newton
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.graph.batch import DiveGraph, indeterminate, make_graph, make_values, solve
+from rovgraph.inference.graph.optimum import covariances, marginals
+from rovgraph.inference.graph.values import key
 from rovgraph.log import Log
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, beliefs
+from rovgraph.problem.measurements import loss_and_weight
 from rovgraph.simulate import CALM, Style, scenario
 
 DEG = np.deg2rad(1.0)

@@ -8,10 +8,10 @@ import pytest
 from autopilot_files import dataflash_of, short_dive
 
 import rovgraph as rg
-from rovgraph.config import load_config
-from rovgraph.config.presets import presets
-from rovgraph.interchange.formats import read_recording
 from rovgraph.log import Log
+from rovgraph.model.config import load_config
+from rovgraph.model.presets import presets
+from rovgraph.readers.formats import read_recording
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "configs" / "bluerov2.yaml"

@@ -12,14 +12,14 @@ import scipy.io
 from folders import same_files
 
 import rovgraph as rg
-from rovgraph.calibrate import calibrate_magnetometer
-from rovgraph.calibrate.turns import calibrate_turns
 from rovgraph.cli import app
-from rovgraph.config import Config, Mag, load_config, parse_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, rotate, rpy_from_matrix, transpose
+from rovgraph.lab.calibrate import calibrate_magnetometer
+from rovgraph.lab.calibrate.magnetometer import calibrate_turns
 from rovgraph.log import STREAMS, Log, Stream, read_log
-from rovgraph.pages.reporting import write_page
+from rovgraph.model.config import Config, Mag, load_config, parse_config
+from rovgraph.report.pages.reporting import write_page
 from rovgraph.sensors import field_direction
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -9,14 +9,13 @@ import pytest
 from folders import same_files
 
 import rovgraph as rg
-from rovgraph.calibrate import calibrate_noise
-from rovgraph.calibrate.allan import allan
-from rovgraph.calibrate.spectrum import spectrum
 from rovgraph.cli import app
-from rovgraph.config import Config, load_config
 from rovgraph.errors import DataWarning, InputError
+from rovgraph.lab.calibrate import calibrate_noise
+from rovgraph.lab.calibrate.noise import allan, spectrum
 from rovgraph.log import STREAMS, Log, Stream
-from rovgraph.thesis import FAN_RAD_PER_SAMPLE, SAMPLE_S, WAVE_HZ
+from rovgraph.model.config import Config, load_config
+from rovgraph.model.thesis import FAN_RAD_PER_SAMPLE, SAMPLE_S, WAVE_HZ
 
 ACC, GYR, ACC_WALK, GYR_WALK = 8.0e-4, 6.9e-4, 3.0e-4, 1.0e-5
 DVL, HEADING, MAG = np.array([0.004, 0.004, 0.002]), np.deg2rad(0.25), 1e-3

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, beliefs, parse_config
-from rovgraph.engine.scale import SCALES
-from rovgraph.engine.unknowns import unknowns
 from rovgraph.errors import InputError
-from rovgraph.graph.keys import key, key_name
-from rovgraph.instruments import instruments
-from rovgraph.state import DIMENSION
+from rovgraph.inference.graph.values import key, key_name
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, beliefs, parse_config
+from rovgraph.model.state import DIMENSION
+from rovgraph.problem.calibration_roles import unknowns
+from rovgraph.problem.motion import SCALES
+from rovgraph.sensors.instruments import instruments
 
 
 def test_every_variable_is_named_by_a_measurement_model():

@@ -17,12 +17,12 @@ from dives import (
     started,
 )
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.geometry import Array
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.graph.isam2 import IncrementalEstimator
 from rovgraph.log import Log
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config
 
 DEG = float(np.deg2rad(1.0))
 TRUTH: dict[str, list[float]] = {

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from dives import altered, batch, changed, falcon, interrupted, simulated, started
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, beliefs
-from rovgraph.engine import chain_optimum, gauss_newton
-from rovgraph.engine.chain import ChainStep
-from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
-from rovgraph.engine.optimum import Optimum
-from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.geometry import Array, log_rotation, transpose
-from rovgraph.graph.batch import make_values
-from rovgraph.graph.optimum import GraphOptimum
-from rovgraph.graph.places import smooth_graph
+from rovgraph.inference import chain_optimum, gauss_newton
+from rovgraph.inference.chain import ChainStep
+from rovgraph.inference.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.graph.batch import make_values
+from rovgraph.inference.graph.optimum import GraphOptimum
+from rovgraph.inference.graph.places import smooth_graph
+from rovgraph.inference.optimum import Optimum
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, beliefs
+from rovgraph.model.state import BIAS, POSE, VELOCITY
 from rovgraph.sensors import SENSORS
 from rovgraph.simulate import Style, Waves, lake
 from rovgraph.simulate import simulated as driven
 from rovgraph.simulate.files import write_log
-from rovgraph.state import BIAS, POSE, VELOCITY
 
 EXACT = 1e-10  # decrease of the cost that is left when both stop here
 UNUSED = "dvl_altitude", "vehicle_tilt"  # the first measures nothing of the vehicle, the other where there is no IMU

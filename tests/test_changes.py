@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, batch, changed, falcon, kept, simulated, true_at, without
 
-from rovgraph.calibration import LAYOUT
-from rovgraph.check import examine
-from rovgraph.config import mount_matrix
+from rovgraph.diagnosis.check import examine
 from rovgraph.dive import _covering, smooth
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.initial_conditions import Beliefs
-from rovgraph.engine.lasting import LastingError, Rival
-from rovgraph.engine.widened_chain import lasting_belief
-from rovgraph.estimators.eskf.error_state import replay
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble, smoothed
 from rovgraph.geometry import rotate, transpose
+from rovgraph.inference.correlated_noise import GaussMarkovError, Rival
+from rovgraph.inference.error_state import replay
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import assemble, smoothed
+from rovgraph.inference.widened_chain import lasting_belief
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.model.calibration import LAYOUT
+from rovgraph.model.config import mount_matrix
+from rovgraph.problem.initial_conditions import Beliefs
 
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
 AT = 70.0
@@ -161,7 +161,7 @@ def test_the_sd_covers_where_rivals_put_the_track(case):
     best = dive.optimum()
     estimate = smoothed(best, dive.initial)
     elsewhere = best.state.p_n + np.array([3.0, -4.0, 0.0])
-    wide = _covering(estimate, [Rival(LastingError("fix", "fix_error", 1.0, 9.0, 20.0), elsewhere)], best)
+    wide = _covering(estimate, [Rival(GaussMarkovError("fix", "fix_error", 1.0, 9.0, 20.0), elsewhere)], best)
     more = wide.trajectory.cov_p - estimate.trajectory.cov_p
     np.testing.assert_allclose(more[:, :2, :2], np.broadcast_to([[9.0, -12.0], [-12.0, 16.0]], (len(more), 2, 2)))
     assert not more[:, 2].any() and not more[:, :, 2].any()

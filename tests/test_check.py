@@ -8,15 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.check import examine, warn
-from rovgraph.check.outlook import keyframes
-from rovgraph.check.times import timing
-from rovgraph.check.values import UPRIGHT
-from rovgraph.config import Config, load_config, mount_matrix
+from rovgraph.diagnosis.check import examine, keyframes, warn
+from rovgraph.diagnosis.check.clocks import timing
+from rovgraph.diagnosis.check.values import UPRIGHT
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import wrap_angle
 from rovgraph.log import STREAMS, Log, Stream, read_log
 from rovgraph.log.frozen import frozen_stretches
+from rovgraph.model.config import Config, load_config, mount_matrix
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 FLIPPED = {"dvl": {"mount_rpy_deg": [180, 0, 0]}}

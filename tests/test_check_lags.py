@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rovgraph.check.lags import ORIENTATIONS, PARTS, correlate, normal_equations, peak, spread
+from rovgraph.diagnosis.check.lags import ORIENTATIONS, PARTS, correlate, normal_equations, peak, spread
 
 
 @pytest.mark.parametrize(("n", "m"), [(50, 80), (80, 50), (7, 7)])

@@ -11,14 +11,14 @@ import pytest
 from dives import Simulated, altered, changed, falcon, merge, simulated, true_at, without
 from ruamel.yaml import YAML
 
-from rovgraph.check import Finding, bridge_jumps, examine
-from rovgraph.check.acceleration import ORIENTATIONS
-from rovgraph.check.agreement import heading_lag
-from rovgraph.check.inertial import inertial_motion
-from rovgraph.config import Config, mount_matrix
+from rovgraph.diagnosis.check import Finding, bridge_jumps, examine
+from rovgraph.diagnosis.check.acceleration import ORIENTATIONS
+from rovgraph.diagnosis.check.agreement import heading_lag
+from rovgraph.diagnosis.check.inertial import inertial_motion
 from rovgraph.errors import DataWarning
 from rovgraph.geometry import matrix_from_rpy, rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.model.config import Config, mount_matrix
 from rovgraph.simulate import CALM, Style
 
 LEVEL = Style(waves=CALM)

@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 
 from rovgraph import __version__
 from rovgraph.cli import app
-from rovgraph.cli.config import key_tables
-from rovgraph.config import describe, load_config, parse_config
+from rovgraph.cli.logs import key_tables
+from rovgraph.model.config import describe, load_config, parse_config
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -256,7 +256,7 @@ def test_the_example_of_the_manual_is_a_log(tmp_path):
 
 
 def test_every_sensor_may_be_given_a_delay():
-    from rovgraph.config.sections import STAMPED
+    from rovgraph.model.config_sections import STAMPED
     from rovgraph.sensors import SENSORS
 
     assert set(STAMPED) == set(SENSORS)

@@ -61,8 +61,8 @@ def save(frame: pd.DataFrame, path: Path) -> Path:
 
 def rms(out: Path, which: str = "smoothed") -> float:
     """Horizontal rms error against the shipped truth [m]."""
-    from rovgraph.evaluate import evaluate, read_reference
-    from rovgraph.trajectory import read_trajectory
+    from rovgraph.inference.trajectory import read_trajectory
+    from rovgraph.lab.evaluate import evaluate, read_reference
 
     return evaluate(read_trajectory(out / f"trajectory_{which}.csv"), read_reference(SHIPPED / "truth.csv.gz")).rms_m
 
@@ -275,7 +275,7 @@ def test_an_older_results_folder_is_kept_unless_forced(monkeypatch, capsys, tmp_
 
 
 def test_a_full_disk_leaves_nothing_and_is_one_line(monkeypatch, capsys, tmp_path, short, config):
-    from rovgraph.trajectory import Trajectory
+    from rovgraph.inference.trajectory import Trajectory
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -300,7 +300,7 @@ def test_a_read_only_place_is_refused_before_the_work(monkeypatch, capsys, tmp_p
 
 HELD = """
 import contextlib, sys, time
-import rovgraph.cli.progress
+import rovgraph.cli.console
 from rovgraph.report import results
 import rovgraph as rg
 from rovgraph.cli.app import main
@@ -314,7 +314,7 @@ def progress_bar():
     yield hold
 
 if sys.argv.pop(1) == "estimating":
-    rovgraph.cli.progress.progress_bar = progress_bar
+    rovgraph.cli.console.progress_bar = progress_bar
 else:
     results.write_results = hold
 main()
@@ -347,8 +347,8 @@ def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config, sho
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="the Ictineu log is not beside the checkout")
 def test_the_real_dive_meets_its_targets(tmp_path, monkeypatch):
-    from rovgraph.evaluate import evaluate, read_reference
-    from rovgraph.trajectory import read_trajectory
+    from rovgraph.inference.trajectory import read_trajectory
+    from rovgraph.lab.evaluate import evaluate, read_reference
 
     out = tmp_path / "out"
     assert run(monkeypatch, "smooth", REAL / "log.csv.gz", "-c", REAL / "ictineu.yaml", "-o", out) == 0

@@ -44,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_no_line_is_longer_than_80_columns_and_no_cell_is_cut(text, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
+    monkeypatch.setattr("rovgraph.lab.plan.cores", lambda: 1)  # each process imports everything anew
     monkeypatch.setattr(sys, "argv", ["rovgraph", *shlex.split(text)])
     monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
     with warnings.catch_warnings(), pytest.raises(SystemExit) as end:

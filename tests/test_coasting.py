@@ -7,15 +7,14 @@ import pytest
 from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
 from motions import predict, problem_of, residual, transition, weights
 
-from rovgraph.engine.preintegration import preintegrate, preintegration_params
-from rovgraph.engine.problem import Problem
-from rovgraph.engine.scale import SCALES
-from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix
-from rovgraph.graph.motion_factors import motion_factor
-from rovgraph.graph.values import state_values
-from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.inference.graph.batch import motion_factor
+from rovgraph.inference.graph.values import state_values
+from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
+from rovgraph.model.state import BIAS, POSE, VELOCITY, State
+from rovgraph.problem.calibration_roles import CalibrationRoles
+from rovgraph.problem.motion import SCALES, preintegrate, preintegration_params
+from rovgraph.problem.problem import Problem
 
 SECONDS = 0.9
 NONE = np.full((15, 15), np.nan)  # covariance of samples that count for nothing
@@ -90,7 +89,7 @@ def test_the_factor_is_the_residual_whitened(dive, motion):
     values.insert(state_values(1, AFTER))
     (r, A_i, A_j), S = residual(motion, BEFORE, AFTER), covariance(motion)
     fixed = {name: np.zeros(3) for name in SCALES}
-    factor = motion_factor(dive, 1, Unknowns(fixed, {}), 1)
+    factor = motion_factor(dive, 1, CalibrationRoles(fixed, {}), 1)
     assert 2.0 * factor.error(values) == pytest.approx(r @ np.linalg.solve(S, r))
     A, _ = factor.linearize(values).jacobian()
     both = np.concatenate([A_i[:, :9], A_j[:, :9], A_i[:, 9:], A_j[:, 9:]], axis=1)

@@ -18,18 +18,14 @@ from scipy.stats import chi2
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.results import residual_frame
+from rovgraph.inference.estimate import Estimate, residual_frame
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.compare import REFERENCE, RUN_COLUMNS, aggregate, compare, measures, nees_band
+from rovgraph.lab.estimators import ESTIMATORS, ChainTask, EstimatorSpec, outcomes, outcomes_of_dives, select
+from rovgraph.lab.executors import in_workers, starting
+from rovgraph.lab.runs import Case, Recorded
 from rovgraph.log import Log
-from rovgraph.report.figure_compare import draw_errors, draw_velocity
-from rovgraph.studies.aggregate import aggregate, nees_band
-from rovgraph.studies.compare import REFERENCE, RUN_COLUMNS, compare
-from rovgraph.studies.estimator_chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
-from rovgraph.studies.estimators import ESTIMATORS, select
-from rovgraph.studies.measures import measures
-from rovgraph.studies.runs import Case, Recorded
-from rovgraph.trajectory import Trajectory
-from rovgraph.workers import in_workers, starting
+from rovgraph.report.figures_studies import draw_errors, draw_velocity
 
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "rovgraph" / "config" / "falcon.yaml"
@@ -133,7 +129,7 @@ def recorded() -> Case:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is given to each worker is done one after another here; a worker takes seconds to start."""
     monkeypatch.setattr(
-        "rovgraph.studies.compare.in_workers", lambda function, tasks, *_: [function(task) for task in tasks]
+        "rovgraph.lab.compare.in_workers", lambda function, tasks, *_: [function(task) for task in tasks]
     )
 
 
@@ -156,7 +152,7 @@ def chain(name: str, *stages: object) -> EstimatorSpec:
 def test_estimators_share_the_stages_they_have_in_common(recorded):
     calls: list[str] = []
 
-    def slow(task: Task) -> str:
+    def slow(task: ChainTask) -> str:
         calls.append("slow")
         spent = time.process_time()
         while time.process_time() - spent < 0.02:
@@ -176,10 +172,10 @@ def test_estimators_share_the_stages_they_have_in_common(recorded):
 
 
 def test_filters_of_several_dives_go_side_by_side_and_share_the_time(recorded):
-    lacking = Task(without(recorded.log, "mag"), recorded.config)
-    short = Task(kept(recorded.log, "imu", recorded.log["imu"].time < 10.0), recorded.config)
+    lacking = ChainTask(without(recorded.log, "mag"), recorded.config)
+    short = ChainTask(kept(recorded.log, "imu", recorded.log["imu"].time < 10.0), recorded.config)
     names = ["dead-reckoning", "4.3a", "4.3b"]
-    done = list(outcomes_of_dives(select(names), [Task(recorded.log, recorded.config), lacking, short]))
+    done = list(outcomes_of_dives(select(names), [ChainTask(recorded.log, recorded.config), lacking, short]))
     assert [(k, o.named.name) for k, o in done] == [(k, name) for k in range(3) for name in names]
     by_name = {(k, o.named.name): o for k, o in done}
     assert "no magnetometer" in str(by_name[1, "4.3a"].error)
@@ -193,11 +189,11 @@ def test_filters_of_several_dives_go_side_by_side_and_share_the_time(recorded):
 
 
 def test_error_state_filters_of_several_dives_are_each_as_they_are_alone(recorded):
-    lacking = Task(without(recorded.log, "dvl_heading"), recorded.config)
-    short = Task(kept(recorded.log, "imu", recorded.log["imu"].time < 15.0), recorded.config)
+    lacking = ChainTask(without(recorded.log, "dvl_heading"), recorded.config)
+    short = ChainTask(kept(recorded.log, "imu", recorded.log["imu"].time < 15.0), recorded.config)
     depth = recorded.config.depth.model_copy(update={"sd_m": 0.5})
-    other = Task(recorded.log, recorded.config.model_copy(update={"depth": depth}))
-    dives = [Task(recorded.log, recorded.config), lacking, short, other]
+    other = ChainTask(recorded.log, recorded.config.model_copy(update={"depth": depth}))
+    dives = [ChainTask(recorded.log, recorded.config), lacking, short, other]
     names = ["ekf-b", "rts-b", "graph-filtered-b"]
     done = {(k, o.named.name): o for k, o in outcomes_of_dives(select(names), dives)}
     assert len(done) == 12
@@ -212,7 +208,7 @@ def test_error_state_filters_of_several_dives_are_each_as_they_are_alone(recorde
 
 
 def test_a_dive_without_an_imu_does_not_stop_the_others(recorded):
-    dives = [Task(without(recorded.log, "imu"), recorded.config), Task(recorded.log, recorded.config)]
+    dives = [ChainTask(without(recorded.log, "imu"), recorded.config), ChainTask(recorded.log, recorded.config)]
     lacking, good = (outcome for _, outcome in outcomes_of_dives(select(["4.3b"]), dives))
     assert "acc_x" in str(lacking.error) and np.isnan(lacking.seconds)
     assert good.error is None and good.seconds > 0.0
@@ -227,10 +223,10 @@ def test_dives_in_groups_give_what_they_give_one_by_one(recorded, in_this_proces
 
 
 def test_any_exception_is_an_outcome(recorded):
-    def broken(task: Task) -> float:
+    def broken(task: ChainTask) -> float:
         return 1.0 / 0.0
 
-    def fine(task: Task) -> Log:
+    def fine(task: ChainTask) -> Log:
         return task.log
 
     done = list(outcomes([chain("a", broken), chain("b", fine)], recorded.log, recorded.config))
@@ -404,7 +400,7 @@ def test_a_script_whose_work_is_not_guarded_is_told_so_in_one_line(tmp_path):
     script.write_text(
         "import math\n"
         "from rovgraph.errors import InputError\n"
-        "from rovgraph.workers import in_workers\n"
+        "from rovgraph.lab.executors import in_workers\n"
         "try:\n"
         "    print(in_workers(math.sqrt, [1.0, 4.0], 2, lambda done: None))\n"
         "except InputError as error:\n"

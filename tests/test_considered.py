@@ -8,19 +8,19 @@ import pytest
 from dives import Simulated, batch, changed, falcon, fed, interrupted, renewed, simulated, started
 from test_consistency import band, nees
 
-from rovgraph.calibration import AUTO, TABLE
-from rovgraph.config import Config, beliefs, parse_config
-from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
-from rovgraph.engine.lasting import LASTING
 from rovgraph.errors import InputError
-from rovgraph.estimators import optimum as optimum_module
-from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
+from rovgraph.inference import smoother as optimum_module
+from rovgraph.inference.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.inference.correlated_noise import LASTING
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.error_state import ErrorStateFilter
+from rovgraph.inference.initialise import initialise
+from rovgraph.model.calibration import AUTO, TABLE
+from rovgraph.model.config import Config, beliefs, parse_config
+from rovgraph.model.state import POSE, VELOCITY, State
 from rovgraph.simulate import scenario
 from rovgraph.simulate.path import Style
-from rovgraph.state import POSE, VELOCITY, State
 
 # sds that an instrument in its mounting may have, small enough for one linearisation
 SD = {"dvl_pitch": 0.3, "dvl_scale": 0.005, "dvl_lever_arm": 0.02, "gyr_scale": 0.005, "depth_offset": 0.1}

@@ -7,12 +7,12 @@ import pytest
 from dives import Simulated, falcon, simulated
 from live import message
 
-from rovgraph.calibration import TABLE
-from rovgraph.engine.filter_step import Gaussian
+from rovgraph.inference.filter_step import Gaussian
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.joining import joined
+from rovgraph.live.intake import joined
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Measurement
+from rovgraph.model.calibration import TABLE
 
 CONSIDERED = [name for name, variable in TABLE.items() if variable.considered]
 END_S = 34.0

@@ -14,11 +14,11 @@ import pytest
 from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, incremental, renewed, true_at
 from scipy.stats import chi2
 
-from rovgraph.config import Config
 from rovgraph.geometry import Array
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.model.config import Config
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import known
-from rovgraph.trajectory import Trajectory
 
 SEEDS = range(1, 25)
 SECONDS, PING_RATE = 100.0, 2.5  # fewer pings than a real DVL

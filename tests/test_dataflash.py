@@ -14,10 +14,10 @@ from pymavlink import DFReader
 from recordings import close, first
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.dataflash_messages import read_messages
-from rovgraph.interchange.formats import Options, read_recording, recognise
-from rovgraph.interchange.recording import Recording
 from rovgraph.log import Log
+from rovgraph.readers.dataflash_messages import read_messages
+from rovgraph.readers.formats import ReadingOptions, read_recording, recognise
+from rovgraph.readers.recording import Recording
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_small.BIN.gz"
 SURFACE = 101_800.0
@@ -42,7 +42,7 @@ def written() -> bytes:
 def read(data: bytes, folder: Path, **choose: str) -> Recording:
     path = folder / "dive.BIN"
     path.write_bytes(data)
-    return read_recording(path, Options(choose=choose))
+    return read_recording(path, ReadingOptions(choose=choose))
 
 
 def imus(count: int, start: float = 0.0, instances: int = 1, rate: float = 25.0) -> DataFlashWriter:

@@ -20,17 +20,17 @@ from dives import (
     true_at,
 )
 
-from rovgraph.config import Config, beliefs
-from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.headings import solve_turn, turn_noise
 from rovgraph.geometry import exp_rotation, wrap_angle
-from rovgraph.instruments import instruments
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.initialise import solve_turn, turn_noise
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels.measurement_row import DT
+from rovgraph.lab.misalignment.plan import GRADES
 from rovgraph.log import Log
+from rovgraph.model.config import Config, beliefs
+from rovgraph.model.state import State
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate import Style
-from rovgraph.state import State
-from rovgraph.studies.misalignment.vehicle import GRADES
-from rovgraph.trajectory import Trajectory
 
 KNOWN = {
     name: np.zeros(dim) for name, dim in (("dvl_compass_offset", 1), ("dvl_compass_deviation", 2), ("hard_iron", 3))

@@ -206,7 +206,7 @@ def test_the_commands_of_a_page_do_their_work_one_after_another(page, folder, tm
     here = tmp_path / "here"
     shutil.copytree(folder, here)
     monkeypatch.chdir(here)
-    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything again
+    monkeypatch.setattr("rovgraph.lab.plan.cores", lambda: 1)  # each process imports everything again
     for text in map(shortened, RUN[page]):
         words = shlex.split(text)
         for k, word in enumerate(words):
@@ -276,7 +276,7 @@ def drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_an_example_says_what_it_promises_and_draws_its_figure(path, remembered, drawing, monkeypatch, capsys):
     known = set(SENSORS)
     monkeypatch.setattr(rg, "smooth", remembered)
-    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything again
+    monkeypatch.setattr("rovgraph.lab.plan.cores", lambda: 1)  # each process imports everything again
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rg.DataWarning)
         try:

@@ -37,8 +37,8 @@ from wire import sentence
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy
-from rovgraph.interchange.formats import read_recording
-from rovgraph.interchange.recording import Recording
+from rovgraph.readers.formats import read_recording
+from rovgraph.readers.recording import Recording
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 RNG = np.random.default_rng(5)

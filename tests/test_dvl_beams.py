@@ -12,10 +12,10 @@ from wire import report
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.interchange.merging import merge
-from rovgraph.interchange.recording import Clock, Recording
 from rovgraph.log.beams import beams_of, usable_beams
-from rovgraph.tables import table_of_arrays
+from rovgraph.log.tables import table_of_arrays
+from rovgraph.readers.merging import merge
+from rovgraph.readers.recording import Clock, Recording
 
 START = 1_750_000_000.0  # Unix time of the dive's start [s]
 UNIX, BOOT = Clock("Unix", 0.0, 0.0, "GPS"), Clock("boot")

@@ -14,9 +14,9 @@ import rovgraph.engine, rovgraph.kernels
 for package in (rovgraph.engine, rovgraph.kernels):
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
         importlib.import_module(module.name)
-from rovgraph.config import Config, beliefs
-from rovgraph.engine.assembly import Assembly
-from rovgraph.instruments import instruments
+from rovgraph.model.config import Config, beliefs
+from rovgraph.problem.assembly import Assembly
+from rovgraph.sensors.instruments import instruments
 from rovgraph.kernels.motion import transitions
 from rovgraph.log import Log, Stream
 

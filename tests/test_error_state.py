@@ -26,40 +26,43 @@ from motions import predict, transition
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
-from rovgraph.calibration import LAYOUT, TABLE, calibration_size
-from rovgraph.config import Config, beliefs
-from rovgraph.engine import error_layout
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, Met
-from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
-from rovgraph.engine.measurements import loss_and_weight, loss_threshold
-from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
-from rovgraph.engine.problem import Index, Problem
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter, replay
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
-from rovgraph.instruments import instruments
+from rovgraph.inference import filter
+from rovgraph.inference.error_state import ErrorStateFilter, replay
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter_step import Gaussian, Met
+from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row
-from rovgraph.kernels.admission import DISTRUSTED_S, RETURN_SD, admit, directions_seen
-from rovgraph.kernels.error_coordinates import ErrorLayout as Coordinates
-from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.motion_row import DURATION, ROW
-from rovgraph.kernels.prediction import predict_filter
-from rovgraph.kernels.robust_update import (
+from rovgraph.kernels.correction import (
+    DISTRUSTED_S,
     MAX_REWEIGHTINGS,
+    RETURN_SD,
     SETTLED,
     Innovations,
     Weights,
+    admit,
+    directions_seen,
     innovation_covariance,
     joseph,
     reweight,
 )
+from rovgraph.kernels.error_coordinates import ErrorColumns as Coordinates
+from rovgraph.kernels.filter_state import FilterModel, FilterState
+from rovgraph.kernels.filtering import predict_filter
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.motion_row import DURATION, ROW
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.log import Log
+from rovgraph.model.calibration import LAYOUT, TABLE, calibration_size
+from rovgraph.model.config import Config, beliefs
+from rovgraph.model.state import DIMENSION, VELOCITY, State
+from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
+from rovgraph.problem.measurements import loss_and_weight, loss_threshold
+from rovgraph.problem.motion import INTEGRATION_SD, preintegrate, preintegration_params
+from rovgraph.problem.problem import Index, Problem
 from rovgraph.sensors import innovation
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate import Style
-from rovgraph.state import DIMENSION, VELOCITY, State
 
 DEG = np.deg2rad(1.0)
 
@@ -239,18 +242,18 @@ def test_a_change_of_basis_is_the_derivative_of_the_retraction_in_coordinates_of
     derivative, basis = np.column_stack(columns), engine.local(moved, known)[1]
     assert np.abs(basis - np.eye(size)).max() > 0.1
     np.testing.assert_allclose(derivative[:, 3:], basis[:, 3:], atol=1e-6)
-    for sensor in error_layout.SEEN:
-        model = error_layout.seen_model(engine.initial.instruments[sensor].model)
+    for sensor in filter.SEEN:
+        model = filter.seen_model(engine.initial.instruments[sensor].model)
         H, there = (engine.layout.matrix(model.predict(k.state, np.zeros((1, 3)))[1])[0] for k in (known, moved))
         np.testing.assert_allclose(there @ derivative, H, atol=1e-6 * np.abs(H).max())
 
 
-@pytest.mark.parametrize("sensor", error_layout.SEEN)
+@pytest.mark.parametrize("sensor", filter.SEEN)
 def test_what_an_instrument_sees_is_linear_in_the_error(sensor):
     """At the size of an unknown heading and mounting, where the first order of `State` is off by per cents."""
     rng = np.random.default_rng(3)
     engine, known = engine_and_estimate(rng)
-    model = error_layout.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
+    model = filter.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
     delta = 0.1 * rng.standard_normal(engine.layout.size)
     z, H = model.predict(known.state, np.zeros((1, 3)))
     moved = model.predict(engine.retract(known, delta, known.P).state, np.zeros((1, 3)))[0]
@@ -736,7 +739,7 @@ def test_a_filter_without_a_compass_never_learns_its_heading(case):
 
 
 def test_in_plain_coordinates_it_would_believe_to(case, monkeypatch):
-    monkeypatch.setattr(error_layout, "SEEN", {})
+    monkeypatch.setattr(filter, "SEEN", {})
     first, last = heading_sd_without_a_compass(case)
     assert last < 0.95 * first
 

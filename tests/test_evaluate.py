@@ -8,9 +8,9 @@ import pytest
 
 from rovgraph.cli.app import main
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.evaluate import evaluate, normalised_error, read_reference
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate
-from rovgraph.trajectory import Trajectory
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.evaluate import evaluate, normalised_error, read_reference
 
 
 def track(n: int = 201, offset=(0.0, 0.0, 0.0), turn_deg: float = 0.0, sd: float = np.nan) -> Trajectory:

@@ -18,10 +18,10 @@ import pytest
 
 import rovgraph as rg
 from rovgraph.cli.app import main
-from rovgraph.export import ExportFormat, Fixes, Options, Track, export_formats, tag, write_track
-from rovgraph.export import formats as registry
 from rovgraph.geometry import Array, matrix_from_rpy
-from rovgraph.trajectory import Trajectory
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.report.export import ExportFormat, ExportOptions, Fixes, Track, export_formats, tag, write_track
+from rovgraph.report.export import formats as registry
 
 ORIGIN = (42.05, 3.12)
 BEGAN = 1_771_000_000.0  # Unix time
@@ -48,8 +48,8 @@ def track(origin: tuple[float, float] | None = ORIGIN, start: float = BEGAN) -> 
     return Track(NAME, "smoothed", circle(start), origin, fixes)
 
 
-def written(name: str, folder, options: Options | None = None, of: Track | None = None):
-    (path,) = write_track(of or track(), [name], folder, options or Options())
+def written(name: str, folder, options: ExportOptions | None = None, of: Track | None = None):
+    (path,) = write_track(of or track(), [name], folder, options or ExportOptions())
     return path
 
 
@@ -131,7 +131,7 @@ def test_gpx_is_read_back_by_gdal(tmp_path):
 def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, crs):
     geopandas = pytest.importorskip("geopandas")
     pytest.importorskip("pyogrio")
-    path = written(name, tmp_path, Options(crs=crs))
+    path = written(name, tmp_path, ExportOptions(crs=crs))
     layer = geopandas.read_file(path if name == "gpkg" else path / "track.shp")
     assert str(layer.crs.to_epsg()) == {None: "4326", "utm": "32631", "EPSG:25831": "25831"}[crs]
     degrees = layer.to_crs(4326).geometry
@@ -141,7 +141,7 @@ def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, cr
 
 def test_nmea_is_read_back_and_no_sentence_is_too_long(tmp_path):
     pynmea2 = pytest.importorskip("pynmea2")
-    lines = written("nmea", tmp_path, Options(rate=2.0)).read_text(encoding="ascii").split()
+    lines = written("nmea", tmp_path, ExportOptions(rate=2.0)).read_text(encoding="ascii").split()
     sentences = [pynmea2.parse(line, check=True) for line in lines]
     gga = [s for s in sentences if s.sentence_type == "GGA"]
     assert len(gga) == 121 and {s.sentence_type for s in sentences} == {"GGA", "HDT", "VTG"}
@@ -317,13 +317,14 @@ def test_times_that_no_calendar_or_ros_has_are_refused_or_left_out(tmp_path):
 def test_coordinates_of_another_place_are_warned_of_and_what_is_no_map_is_refused(tmp_path):
     pytest.importorskip("pyproj")
     with pytest.warns(rg.DataWarning, match="WGS 84 / UTM zone 55S is not made for 42.050, 3.120"):
-        written("gpkg", tmp_path / "south", Options(crs="EPSG:32755"))
+        written("gpkg", tmp_path / "south", ExportOptions(crs="EPSG:32755"))
     for crs in ("EPSG:4978", "EPSG:5773"):
         with pytest.raises(rg.InputError, match="is no map's coordinates"):
-            written("gpkg", tmp_path, Options(crs=crs))
+            written("gpkg", tmp_path, ExportOptions(crs=crs))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        written("gpkg", tmp_path / "pacific", Options(crs="EPSG:3832"), replace(track(), origin=(-17.0, 179.9999)))
+        pacific = replace(track(), origin=(-17.0, 179.9999))
+        written("gpkg", tmp_path / "pacific", ExportOptions(crs="EPSG:3832"), pacific)
 
 
 @pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "gpkg", "nmea", "sbet"])
@@ -344,11 +345,11 @@ def test_bad_names_and_rates_and_files_that_are_there_are_refused(tmp_path):
     with pytest.raises(rg.InputError, match="is no format, nearest is geojson"):
         written("geojsn", tmp_path)
     with pytest.raises(rg.InputError, match="rate 0: expected one above 0"):
-        written("gpx", tmp_path, Options(rate=0.0))
+        written("gpx", tmp_path, ExportOptions(rate=0.0))
     with pytest.raises(rg.InputError, match="crs 'EPSG:1': is not known"):
-        written("gpkg", tmp_path, Options(crs="EPSG:1"))
+        written("gpkg", tmp_path, ExportOptions(crs="EPSG:1"))
     with pytest.raises(rg.InputError, match="crs 32632: expected text, such as EPSG:25832"):
-        written("gpkg", tmp_path, Options(crs=32632))  # type: ignore[arg-type]
+        written("gpkg", tmp_path, ExportOptions(crs=32632))  # type: ignore[arg-type]
     written("tum", tmp_path)
     with pytest.raises(rg.InputError, match="exists; choose another --out or give --force"):
         written("tum", tmp_path)
@@ -584,5 +585,5 @@ def test_what_a_writers_library_cannot_write_is_refused_in_one_line(tmp_path, mo
 
 def test_a_format_that_fails_leaves_nothing_of_the_others(tmp_path):
     with pytest.raises(rg.InputError, match="crs 'EPSG:bogus'"):
-        write_track(track(), ["kml", "gpkg"], tmp_path / "out", Options(None, "EPSG:bogus"))
+        write_track(track(), ["kml", "gpkg"], tmp_path / "out", ExportOptions(None, "EPSG:bogus"))
     assert not [*tmp_path.glob("out/*")]

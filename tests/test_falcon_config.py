@@ -7,14 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, load_config, mount_matrix, with_priors_stated
 from rovgraph.geometry import exp_rotation
-from rovgraph.instruments import instruments
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, load_config, mount_matrix, with_priors_stated
+from rovgraph.model.state import State
+from rovgraph.model.thesis import FLIP, R_DVL, R_MTI, THETA_DVL, THETA_MTI
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import secrets, write_log
-from rovgraph.state import State
-from rovgraph.thesis import FLIP, R_DVL, R_MTI, THETA_DVL, THETA_MTI
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "data" / "falcon"

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.fast_csv import ROWS, write_csv, write_sparse_csv
+from rovgraph.log.csv_writer import ROWS, write_csv, write_sparse_csv
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 1e-12, 123456789.123, 1e300, np.pi, -2.5e-7])
 

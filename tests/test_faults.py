@@ -129,7 +129,7 @@ def test_a_ping_is_the_motion_of_the_dvl_itself(lively):
 
 def test_the_simulator_imports_nothing_of_rovgraph():
     """But the command that is judged, and the pool of processes."""
-    allowed = {"judge": {"rovgraph.cli.app"}, "campaign": {"rovgraph.workers"}}
+    allowed = {"judge": {"rovgraph.cli.app"}, "campaign": {"rovgraph.lab.executors"}}
     for path in (BENCHMARKS / "fault_campaign").glob("*.py"):
         nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         found = {n.module for n in nodes if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("rovgraph")}

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from dives import RecordingFilter, Simulated, falcon, fed, simulated
 
-from rovgraph.engine.assembly import InsertResult
-from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
-from rovgraph.estimators.initialise import initialise
+from rovgraph.inference.filter_step import Gaussian
+from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
+from rovgraph.inference.initialise import initialise
 from rovgraph.live import reinitialisations
-from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
+from rovgraph.live.files import read_checkpoint, write_checkpoint
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.log import Measurement
+from rovgraph.problem.assembly import InsertResult
+from rovgraph.problem.initial_conditions import InitialConditions
 
 LAG, HOLD = 5.0, 0.3
 

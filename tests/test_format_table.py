@@ -23,7 +23,7 @@ from test_xsens_mtb_files import recorded as xsens_recording
 from wire import report
 
 import rovgraph as rg
-from rovgraph.interchange import formats
+from rovgraph.readers import formats
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 START = 1_750_000_000.0  # Unix time [s]

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, falcon, kept, position_errors, rms, simulated
 
-from rovgraph.check import examine
-from rovgraph.config import Config
+from rovgraph.diagnosis.check import examine
 from rovgraph.dive import smooth
 from rovgraph.geometry import Array
-from rovgraph.live.faults import Faults
+from rovgraph.live.sensor_faults import Faults
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import (
     BRAKING,
@@ -22,6 +21,7 @@ from rovgraph.log.frozen import (
     frozen_stretches,
     without_frozen,
 )
+from rovgraph.model.config import Config
 from rovgraph.simulate import CALM, Style
 
 FROM, TO = 60.0, 120.0

@@ -20,20 +20,18 @@ from dives import Simulated, as_log, changed, falcon, simulated, started, withou
 from live import message, turned
 from test_no_imu import with_attitude
 
-from rovgraph.config import Config
 from rovgraph.diagnosis import Alarm
-from rovgraph.dive import Dive, smooth
-from rovgraph.estimators.estimate import Estimate
+from rovgraph.dive import DiveEstimates, smooth
 from rovgraph.geometry import Array
+from rovgraph.inference.estimate import Estimate
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
+from rovgraph.model.config import Config
 from rovgraph.simulate import Choices, Style, Waves, scenario, simulate
-from rovgraph.simulate.autopilot import Steps, VelocityControl
-from rovgraph.simulate.driven import drive
+from rovgraph.simulate.driven import Steps, VelocityControl, World, drive
+from rovgraph.simulate.environment import Sea
 from rovgraph.simulate.named import lake
-from rovgraph.simulate.sea import Sea
-from rovgraph.simulate.worlds import World
 
 GOLDEN = Path(__file__).parent / "golden"
 # by how much numbers may differ from those of another machine, with other libraries and instructions
@@ -199,7 +197,7 @@ def estimated(estimate: Estimate) -> dict[str, Any]:
     return {**track(estimate), "calibration": constants, "mean_squares": squares.to_dict()}
 
 
-def smoothed_summary(dive: Dive) -> dict[str, Any]:
+def smoothed_summary(dive: DiveEstimates) -> dict[str, Any]:
     return judged(dive.verdict, dive.alarms) | {
         e.kind: estimated(e) for e in dive.estimates if e.kind != "dead_reckoning"
     }

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from test_api import SHIPPED, command
 
 import rovgraph as rg
-from rovgraph.interchange.guessing.names import meaning
-from rovgraph.tables import read_table
+from rovgraph.log.tables import read_table
+from rovgraph.readers.guessing.names import meaning
 
 G, DEG = 9.80665, float(np.rad2deg(1.0))
 XYZ = ("x", "y", "z")

@@ -6,30 +6,27 @@ import numpy as np
 import pytest
 from dives import altered, as_log, batch, changed, initial_conditions, kept, rms, same, without
 
-from rovgraph.config import Config
-from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
-from rovgraph.engine.assembly import assembly_of
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, replay
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
-from rovgraph.instruments import hydrodynamics, instruments
+from rovgraph.inference.error_state import REINITIALISE_AT_S, replay
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import BatchSmoother
 from rovgraph.kernels.assembly import UPTO
 from rovgraph.kernels.measurement_row import RATE, TIME
+from rovgraph.lab.estimators import ESTIMATORS, outcomes, select
 from rovgraph.log import Log, Stream
+from rovgraph.model.config import Config
+from rovgraph.model.state import POSE, State
+from rovgraph.problem.admission import OLDEST_SIGNAL_S, PIECE_S
+from rovgraph.problem.assembly import assembly_of
 from rovgraph.sensors import ModelAiding, WaterVelocity
+from rovgraph.sensors.instruments import hydrodynamics, instruments
 from rovgraph.simulate import Choices, Dive, simulate
 from rovgraph.simulate import simulated as simulated_dive
-from rovgraph.simulate.autopilot import Steps, VelocityControl
-from rovgraph.simulate.driven import drive
+from rovgraph.simulate.driven import Steps, VelocityControl, World, drive
+from rovgraph.simulate.environment import Sea
 from rovgraph.simulate.named import lake
-from rovgraph.simulate.sea import Sea
-from rovgraph.simulate.worlds import World
-from rovgraph.state import POSE, State
-from rovgraph.studies.estimator_chains import outcomes
-from rovgraph.studies.estimators import ESTIMATORS, select
 
 COEFFICIENTS = ("drag_linear", "drag_quadratic")
 CURRENT = np.array([0.06, -0.04])

@@ -9,18 +9,18 @@ from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
 from motions import predict
 from test_calibration_recovery import PINGS, errors
 
-from rovgraph.config import beliefs
-from rovgraph.engine import gauss_newton
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.problem import Problem
-from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import log_rotation, rotate, transpose
-from rovgraph.graph.motion_factors import motion_factor
-from rovgraph.graph.places import smooth_graph
-from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.inference import gauss_newton
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter_step import Gaussian
+from rovgraph.inference.graph.batch import motion_factor
+from rovgraph.inference.graph.places import smooth_graph
+from rovgraph.inference.graph.values import insert_calibration, insert_state
+from rovgraph.model.config import beliefs
+from rovgraph.model.state import VELOCITY, State
+from rovgraph.problem.calibration_roles import CalibrationRoles, unknowns
+from rovgraph.problem.problem import Problem
 from rovgraph.simulate import Style, Waves
-from rovgraph.state import VELOCITY, State
 
 SCALES = {"acc_scale": [0.01, -0.008, 0.006], "gyr_scale": [-0.01, 0.008, 0.01]}
 WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
@@ -66,7 +66,7 @@ def test_scales_that_are_known_are_held_and_fit():
 K = 60  # a lively interval
 
 
-def dive_and_states() -> tuple[Problem, Unknowns, State, State]:
+def dive_and_states() -> tuple[Problem, CalibrationRoles, State, State]:
     """A dive, with states around interval `K` that do not quite fit it."""
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))

@@ -20,28 +20,24 @@ from dives import (
 from live import message
 
 from rovgraph.dive import smooth
-from rovgraph.engine.chain_optimum import smooth_chain
-from rovgraph.engine.filter_step import calibration_vector, states_of
 from rovgraph.errors import InputError
-from rovgraph.estimators import incremental as incremental_module
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.eskf.fixed_lag import FixedLag
-from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import smoothed as smoothed_results
 from rovgraph.geometry import Array, log_rotation, transpose
-from rovgraph.graph.keys import CALIBRATION, key
-from rovgraph.graph.linear_intervals import IntervalTerms, Linearization
-from rovgraph.graph.measurement_factors import measurement_factor
-from rovgraph.graph.motion_factors import motion_factor
-from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.inference.chain_optimum import smooth_chain
+from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.inference.filter_step import calibration_vector, states_of
+from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.graph import isam2 as incremental_module
+from rovgraph.inference.graph.batch import measurement_factor, motion_factor
+from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator, IntervalTerms, Linearization
+from rovgraph.inference.graph.values import CALIBRATION, insert_calibration, insert_state, key
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import smoothed as smoothed_results
 from rovgraph.kernels.layout import MOTION
+from rovgraph.lab.estimators import outcomes, select
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
-from rovgraph.state import BIAS, POSE, VELOCITY
-from rovgraph.studies.estimator_chains import outcomes
-from rovgraph.studies.estimators import select
+from rovgraph.model.state import BIAS, POSE, VELOCITY
 
 DEG = np.deg2rad(1.0)
 UNIT = gtsam.noiseModel.Unit.Create(6)

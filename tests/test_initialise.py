@@ -19,17 +19,16 @@ from dives import (
     without,
 )
 
-from rovgraph.config import Config, parse_config
-from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.errors import InputError
-from rovgraph.estimators.headings import trusted_first
-from rovgraph.estimators.initialise import UNKNOWN_HEADING_SD, initialise, sample_density
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.inference.initialise import UNKNOWN_HEADING_SD, by_accuracy, initialise, sample_density
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
+from rovgraph.model.config import Config, parse_config
+from rovgraph.model.state import State
+from rovgraph.problem.initial_conditions import StatePrior
 from rovgraph.simulate import Path, Style, scenario
 from rovgraph.simulate.scenario import SCENARIOS
-from rovgraph.state import State
-from rovgraph.trajectory import Trajectory
 
 DEG = np.deg2rad(1.0)
 G = 9.81
@@ -209,7 +208,7 @@ def test_without_sources_in_the_configuration_the_magnetometer_goes_before_the_i
 
 def test_the_source_that_is_known_best_is_asked_first():
     config = falcon(calibration={"mag_offset": {"estimate": True, "sd_deg": 9}, "ahrs_offset": {"estimate": False}})
-    assert trusted_first(config, ["mag", "ahrs", "dvl_heading"]) == ["ahrs", "dvl_heading", "mag"]
+    assert by_accuracy(config, ["mag", "ahrs", "dvl_heading"]) == ["ahrs", "dvl_heading", "mag"]
 
 
 def test_without_any_heading_it_says_what_to_give(every_source):

@@ -18,12 +18,12 @@ from dives import changed, falcon, rms, simulated
 from test_api import command
 
 import rovgraph as rg
-from rovgraph.config import completed
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import Options, formats
-from rovgraph.interchange.merging import Merged, merge
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
-from rovgraph.interchange.stamps import put_in_order
+from rovgraph.model.config import completed
+from rovgraph.readers.formats import ReadingOptions, formats
+from rovgraph.readers.merging import Merged, merge
+from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.readers.stamps import put_in_order
 from rovgraph.simulate import Style, Waves
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "ictineu"
@@ -287,7 +287,7 @@ class Toy:
     def recognise(self, path: Path, head: bytes) -> float:
         return 1.0 if head.startswith(b"TOY") else 0.0
 
-    def read(self, path: Path, options: Options) -> Recording:
+    def read(self, path: Path, options: ReadingOptions) -> Recording:
         text = path.read_text(encoding="utf-8").removeprefix("TOY")
         columns = {name: np.array(values) for name, values in json.loads(text).items()}
         options.progress(len(text), len(text))
@@ -313,7 +313,7 @@ def toy(monkeypatch):
     def broken() -> None:
         raise ImportError("no module named toys")
 
-    module = sys.modules["rovgraph.interchange.formats"]
+    module = sys.modules["rovgraph.readers.formats"]
     monkeypatch.setattr(module, "entry_points", lambda group: [Entry(Toy), Entry(broken)])
     formats.cache_clear()
     with pytest.warns(rg.DataWarning, match="toy of toys:FORMAT cannot be loaded"):
@@ -486,9 +486,9 @@ def test_the_format_of_the_manual_reads_its_file(tmp_path, dive):
     path = tmp_path / "my.txt"
     path.write_text("".join(f"$MYDVL,{','.join(map(repr, row.tolist()))}\n" for row in rows), encoding="utf-8")
     assert made["FORMAT"].recognise(path, path.read_bytes()[:64]) == 1.0
-    (own,) = made["FORMAT"].read(path, Options()).channels
+    (own,) = made["FORMAT"].read(path, ReadingOptions()).channels
     assert own.columns["dvl_vy"] == pytest.approx(rows[:, 2])
-    assert merge([made["FORMAT"].read(path, Options())], {}, {}).frame["dvl_vz"].notna().all()
+    assert merge([made["FORMAT"].read(path, ReadingOptions())], {}, {}).frame["dvl_vz"].notna().all()
 
 
 HOSTILE = {
@@ -572,7 +572,7 @@ def test_a_log_of_one_message_that_does_not_fit_into_memory_is_refused_and_not_c
     code = f"""
 import resource, sys
 import rovgraph as rg
-from rovgraph.interchange import formats
+from rovgraph.readers import formats
 from rovgraph.cli.app import main
 formats()
 held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()

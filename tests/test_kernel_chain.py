@@ -12,8 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError
-from rovgraph.engine.linear_chain import MotionRows, eliminate
+from rovgraph.inference.chain_information import MeasurementRows, MotionRows, SquareRoot, UndeterminedError, eliminate
 
 CHAINS = [(6, 15, 0, 0), (6, 15, 0, 4), (5, 15, 2, 5), (4, 15, 2, 0), (1, 15, 0, 3), (7, 3, 1, 20)]
 

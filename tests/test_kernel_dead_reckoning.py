@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from rovgraph.geometry import earth_rate_n, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, transpose
-from rovgraph.kernels.dead_reckoning import Aiding, Motions, Start, Surroundings, reckon_attitude
+from rovgraph.kernels.dead_reckoning import Aiding, LevelStart, Motions, Surroundings, reckon_attitude
 
 G, DT = 9.81, 0.2
 DENSITY = np.array([0.05**2, 1e-3**2, 1e-5**2])
@@ -40,7 +40,7 @@ def reckoned(
     P = np.array([np.diag(sd**2) for sd in SD])
     motions = Motions(tables["outage"], dt, dR, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)))
     aiding = Aiding(tables["dvl"], tables["compass"], tables["reference"])
-    reckon_attitude(motions, aiding, Start(np.ascontiguousarray(start), np.zeros(3), P), around, R, b)
+    reckon_attitude(motions, aiding, LevelStart(np.ascontiguousarray(start), np.zeros(3), P), around, R, b)
     return R, b, true
 
 
@@ -84,7 +84,7 @@ def test_the_velocity_of_pings_is_told_from_tilt():
         nothing, same = np.tile([0.0, math.inf, 0.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
         P = np.array([np.diag(sd**2) for sd in SD])
         motions = Motions(np.zeros(n, bool), dt, same, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)))
-        start = Start(np.eye(3), np.zeros(3), P)
+        start = LevelStart(np.eye(3), np.zeros(3), P)
         reckon_attitude(motions, Aiding(dvl, nothing, same), start, around, R, b)
         return float(np.abs(rpy_from_matrix(R)[:, 1]).max())
 

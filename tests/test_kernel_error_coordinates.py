@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from test_sensors import SENSORS, random_state
 
-from rovgraph.calibration import LAYOUT, SIZE, TABLE
-from rovgraph.engine.error_layout import SEEN, seen_model
-from rovgraph.engine.error_layout import ErrorLayout as Layout
-from rovgraph.engine.filter_step import states_of
 from rovgraph.geometry import Array, exp_rotation
-from rovgraph.kernels.change_of_basis import change_basis
-from rovgraph.kernels.error_coordinates import ErrorLayout, Scratch, local, make_scratch, retract
+from rovgraph.inference.filter import SEEN, seen_model
+from rovgraph.inference.filter import ErrorLayout as Layout
+from rovgraph.inference.filter_step import states_of
+from rovgraph.kernels.error_coordinates import ErrorColumns, ErrorScratch, change_basis, local, make_scratch, retract
 from rovgraph.kernels.states import Epoch
+from rovgraph.model.calibration import LAYOUT, SIZE, TABLE
+from rovgraph.model.state import VELOCITY, State
 from rovgraph.sensors import CompiledModel, innovation
-from rovgraph.state import VELOCITY, State
 
 N = 8
 COMPASSES = ("dvl_compass_offset", "dvl_compass_deviation", "ahrs_offset", "ahrs_deviation")
@@ -61,7 +60,7 @@ def one(state: State, k: int) -> Epoch:
     return Epoch(state.R_nb[k].copy(), state.p_n[k].copy(), state.v_n[k].copy(), state.bias[k].copy(), c)
 
 
-def prepared(layout: Layout) -> tuple[ErrorLayout, Scratch, Array]:
+def prepared(layout: Layout) -> tuple[ErrorColumns, ErrorScratch, Array]:
     own = layout.coordinates
     return own, make_scratch(len(own.seen), SIZE), np.eye(layout.size)
 

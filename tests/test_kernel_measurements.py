@@ -10,15 +10,15 @@ import pytest
 from motions import Delta
 from motions import propagate as propagate_all
 
-from rovgraph.calibration import LAYOUT, SIZE, TABLE, Variable, calibration_size, register
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, wrap_angle
 from rovgraph.kernels import layout
 from rovgraph.kernels import measurements as kernels
-from rovgraph.kernels.propagation import WORK, Snapshot, chain, propagate, propagation_jacobian
+from rovgraph.kernels.linearization import WORK, Snapshot, chain, propagate, propagation_jacobian
 from rovgraph.kernels.states import Epoch, States
 from rovgraph.kernels.weighting import LOSSES, loss_weight, robust_cost, weight_many, whiten_many
+from rovgraph.model.calibration import LAYOUT, SIZE, TABLE, Variable, calibration_size, register
+from rovgraph.model.state import PLACE_DIM, State
 from rovgraph.sensors import CompassHeading, Position
-from rovgraph.state import PLACE_DIM, State
 
 N, STEP = 5, 1e-6
 RNG = np.random.default_rng(0)

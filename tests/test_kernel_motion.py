@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
-from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
-from rovgraph.kernels.motion import transitions
+from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD, transitions
 from rovgraph.kernels.motion_residual import (
     motion_covariance,
     motion_errors,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from rovgraph.estimators.thesis.core import Polynomials, iterated_update, propagate_covariance
 from rovgraph.geometry import Array
+from rovgraph.lab.thesis.core import Polynomials, iterated_update, propagate_covariance
 
 FILTERS, STATES, MEASURED, MOVING = 3, 7, 4, 5
 ALL = np.ones((FILTERS, MEASURED), bool)

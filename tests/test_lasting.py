@@ -5,17 +5,17 @@ import pytest
 from dives import changed, falcon, incremental, renewed, rms, simulated, smoothed, true_at
 from scipy.stats import chi2
 
-from rovgraph.calibration import LAYOUT
-from rovgraph.config import beliefs, parse_config
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.optimum import joint_prior_sd
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble, newest_calibration
-from rovgraph.gauss_markov import stationary_walk, walked
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.optimum import joint_prior_sd
+from rovgraph.inference.smoother import assemble, newest_calibration
+from rovgraph.model.calibration import LAYOUT
+from rovgraph.model.config import beliefs, parse_config
+from rovgraph.model.gauss_markov import stationary_walk, walked
+from rovgraph.model.state import POSE
 from rovgraph.simulate import Truth
+from rovgraph.simulate.dive import draw_lasting
 from rovgraph.simulate.files import known
-from rovgraph.simulate.lasting import draw_lasting
-from rovgraph.state import POSE
 
 FIXES = {"fix": {"sd_m": 0.1}, "start": {"position_sd_m": 0.1}}
 LASTING = {"fix_error": {"estimate": True, "sd": 1.0, "time_constant_s": 20.0}}

@@ -14,7 +14,7 @@ from rovgraph.diagnosis import RULES, Statistic
 from rovgraph.live.alarms import OVER_S, LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
-from rovgraph.live.outputs.lines import json_line
+from rovgraph.live.outputs.json_lines import json_line
 from rovgraph.live.solution import Event, Solution
 from rovgraph.log import Log
 from rovgraph.report.status import status

@@ -11,12 +11,10 @@ from dives import Simulated, falcon, simulated
 
 import rovgraph as rg
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.commands import DropMark, RemoveMark, SetPosition
-from rovgraph.live.feed import Feed
 from rovgraph.live.files import RECORDING, Files
-from rovgraph.live.marks import MARKS, Marks
+from rovgraph.live.marks import MARKS, DropMark, Marks, RemoveMark, SetPosition
 from rovgraph.live.navigator import Navigator
-from rovgraph.live.session import Session
+from rovgraph.live.session import Feed, Session
 from rovgraph.live.sources.replay import LogReplay
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import read_log

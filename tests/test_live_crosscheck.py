@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dives import Simulated, falcon, simulated
 
-from rovgraph.live.crosscheck import Crosscheck
+from rovgraph.live.sensor_faults import Crosscheck
 from rovgraph.log import Measurement
 
 RIGHT = {"ahrs_offset": {"estimate": False}, "ahrs_deviation": {"estimate": False}}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rovgraph.live.faults import WAIT, Faults, Verdict
+from rovgraph.live.sensor_faults import WAIT, Faults, Screening
 from rovgraph.log import Measurement
 from rovgraph.log.frozen import HOLDS, TURNED
 
@@ -97,14 +97,14 @@ def test_a_lost_bottom_lock_is_said_once():
     assert kinds(faults) == ["no lock"]
 
 
-def looked(faults: Faults, m: Measurement) -> Verdict:
+def looked(faults: Faults, m: Measurement) -> Screening:
     """A measurement after the samples of an IMU that works, until then."""
     for k in range(10):
         faults.look(sample(m.time - 0.2 + 0.02 * k))
     return faults.look(m)
 
 
-def equal_pings(count: int, before: int = 20) -> tuple[list[Verdict], Faults]:
+def equal_pings(count: int, before: int = 20) -> tuple[list[Screening], Faults]:
     """What is done with equal pings, one every 0.2 s, after others."""
     faults = Faults()
     for k in range(before):
@@ -118,7 +118,7 @@ def test_equal_pings_wait_and_are_taken_back_from_the_first_when_they_last_as_lo
     assert [v.use for v in verdicts] == [True] * (WAIT["dvl"] - 1) + [False] * (longest + 6 - WAIT["dvl"])
     assert [(k, v.retract_since) for k, v in enumerate(verdicts) if v.retract_since is not None] == [(2, 0.0)]
     assert sum(v.count for v in verdicts if not v.use) == longest + 5
-    assert looked(faults, moving(4.0)) == Verdict()
+    assert looked(faults, moving(4.0)) == Screening()
     assert kinds(faults) == ["frozen", "back"]
 
 

@@ -26,14 +26,14 @@ from wire import (
     vision,
 )
 
-from rovgraph.config import Config
 from rovgraph.live.message import GEODETIC, Message
+from rovgraph.live.sources.doppler import waterlinked
 from rovgraph.live.sources.json_lines import json_lines
+from rovgraph.live.sources.links import timed_frames
 from rovgraph.live.sources.nmea import nmea
-from rovgraph.live.sources.recordings import timed_frames
 from rovgraph.live.sources.source import Decoder
-from rovgraph.live.sources.waterlinked import waterlinked
 from rovgraph.log import STREAMS
+from rovgraph.model.config import Config
 
 TLOG = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_small.tlog.gz"
 LONGEST_FRAME = 293  # bytes of MAVLink

@@ -19,11 +19,10 @@ from hypothesis import strategies as st
 
 from rovgraph.errors import InputError
 from rovgraph.live.outputs import FORMS, open_output
-from rovgraph.live.outputs.lines import json_line
-from rovgraph.live.outputs.mavlink_messages import gps_input, vision_position_estimate
+from rovgraph.live.outputs.json_lines import StandardOutput, json_line
+from rovgraph.live.outputs.mavlink import gps_input, vision_position_estimate
 from rovgraph.live.outputs.nmea import gga, hdt
-from rovgraph.live.outputs.standard import StandardOutput
-from rovgraph.live.outputs.url import parsed
+from rovgraph.live.outputs.output import parsed
 from rovgraph.live.solution import Event, SensorHealth, Solution
 from rovgraph.live.warnings import Warnings
 
@@ -405,7 +404,7 @@ def test_readers_come_and_go(said, warnings):
 def test_closing_waits_half_a_second_at_most_for_a_reader_that_does_not_read(monkeypatch):
     slept = []
     clock = SimpleNamespace(monotonic=lambda: sum(slept), sleep=slept.append)
-    monkeypatch.setattr("rovgraph.live.outputs.tcp.time", clock)
+    monkeypatch.setattr("rovgraph.live.outputs.json_lines.time", clock)
     port = free_port()
     out = open_output(f"tcp://:{port}")
     reader = socket.create_connection(("127.0.0.1", port))

@@ -21,22 +21,18 @@ from websockets.typing import Subprotocol
 import rovgraph as rg
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
-from rovgraph.live.commands import DropMark, RemoveMark, SetPosition
-from rovgraph.live.feed import Feed
-from rovgraph.live.marks import Marks
+from rovgraph.live.marks import DropMark, Marks, RemoveMark, SetPosition
+from rovgraph.live.session import Feed
 from rovgraph.live.solution import Event, SensorHealth, Solution
+from rovgraph.web import broadcast
 from rovgraph.web import broadcast as broadcasting
-from rovgraph.web import connections
-from rovgraph.web import track as tracking
-from rovgraph.web.address import parse_address, parse_origin, token_of
-from rovgraph.web.app import application
+from rovgraph.web import view as tracking
+from rovgraph.web.app import BURST, LARGEST_BODY, application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts, read_charts
-from rovgraph.web.guard import LARGEST_HEADERS, Guard
+from rovgraph.web.guard import LARGEST_HEADERS, Guard, parse_address, parse_origin, token_of
 from rovgraph.web.page import MOST_CONNECTIONS
-from rovgraph.web.requests import BURST, LARGEST_BODY
-from rovgraph.web.track import PIECE, Track
-from rovgraph.web.view import Limits, View
+from rovgraph.web.view import PIECE, LiveTrack, PageLimits, View
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & δύτης 潜水"
 TOKEN = "a-token-of-24-characters"
@@ -65,7 +61,7 @@ class Server:
 
     def __init__(self, token: str | None = None, origins: tuple[str, ...] = (), charts: Charts | None = None) -> None:
         self.marks, self.commands = Marks(), []
-        self.view = View(self.marks, Limits())
+        self.view = View(self.marks, PageLimits())
         self.broadcast = Broadcast(self.view)
         app = application(self.broadcast, charts or Charts(()), lambda command: self.commands.append(command) or True)
         self.client = TestClient(Guard(app, token, origins), base_url="http://127.0.0.1:8080")
@@ -126,7 +122,7 @@ def test_the_track_is_geojson_where_the_origin_is_known(server):
 
 def test_a_track_of_any_length_stays_bounded_and_in_order(monkeypatch):
     monkeypatch.setattr(tracking, "MOST", 11 * PIECE)
-    track = Track()
+    track = LiveTrack()
     for k in range(11 * PIECE + 10):
         track.add(solution(0.1 * k, 0.2 * k))
     assert len(track) < 11 * PIECE and track.edition == 1
@@ -578,7 +574,7 @@ def test_a_page_that_speaks_while_it_is_told_something_is_closed_too():
     async def serve():
         socket = SpeaksAsItIsTold()
         async with asyncio.timeout(5.0):
-            await Broadcast(View(Marks(), Limits())).serve(socket)
+            await Broadcast(View(Marks(), PageLimits())).serve(socket)
         return socket.closed
 
     assert asyncio.run(serve()) == 1008
@@ -610,8 +606,8 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeyp
 
 def test_a_page_that_answers_no_ping_is_dropped_and_counted(monkeypatch):
     """What little it was sent fits into its buffers."""
-    monkeypatch.setattr(connections, "PING_S", 0.3)
-    monkeypatch.setattr(connections, "PONG_S", 0.3)
+    monkeypatch.setattr(broadcast, "PING_S", 0.3)
+    monkeypatch.setattr(broadcast, "PONG_S", 0.3)
     with rg.live_page("127.0.0.1:0") as page, socket.create_connection(("127.0.0.1", page.address.port)) as deaf:
         deaf.sendall(HANDSHAKE)
         end = time.monotonic() + 20
@@ -684,7 +680,7 @@ HEAD = b"POST /api/marks HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: applicatio
 
 @pytest.mark.parametrize("said", [b"", START], ids=["silent", "half"])
 def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, said):
-    monkeypatch.setattr(connections, "REQUEST_S", 4.0)
+    monkeypatch.setattr(broadcast, "REQUEST_S", 4.0)
     url, links = f"{page.address.url}api/state", []
     try:
         for _ in range(MOST_CONNECTIONS + 6):
@@ -702,7 +698,7 @@ def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, 
 
 @pytest.mark.parametrize("said", [b"", START, HEAD, START + b"\r\n" + START], ids=["silent", "half", "body", "second"])
 def test_a_connection_without_a_whole_request_is_ended(page, monkeypatch, said):
-    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
+    monkeypatch.setattr(broadcast, "REQUEST_S", 0.5)
     with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
         link.sendall(said)
         while link.recv(1000):

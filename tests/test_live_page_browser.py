@@ -8,10 +8,9 @@ from browsers import chromium
 from test_live_page import NASTY, solution
 
 import rovgraph as rg
-from rovgraph.live.commands import DropMark, SetPosition
-from rovgraph.live.marks import Marks
+from rovgraph.live.marks import DropMark, Marks, SetPosition
 from rovgraph.live.solution import Event, SensorHealth
-from rovgraph.web.track import STEP_M
+from rovgraph.web.view import STEP_M
 
 WIDTHS = (400, 1600)
 SLOWEST_MS = 100.0

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
 from rovgraph.errors import InputError
-from rovgraph.live.checkpoint import ARRAY, read_checkpoint, write_checkpoint
+from rovgraph.live.files import ARRAY, Recorder, read_checkpoint, recorded_columns, write_checkpoint
 from rovgraph.live.message import GEODETIC, Reading
-from rovgraph.live.recorder import Recorder, recorded_columns
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
 
@@ -118,7 +117,7 @@ def test_rows_wait_a_fifth_of_a_second_at_most_for_the_operating_system_and_a_se
             waits.add(timeout)
             return super().wait(timeout)
 
-    monkeypatch.setattr("rovgraph.live.recorder.threading", SimpleNamespace(Event=Stop, Thread=threading.Thread))
+    monkeypatch.setattr("rovgraph.live.files.threading", SimpleNamespace(Event=Stop, Thread=threading.Thread))
     recorder = Recorder(tmp_path / "r.csv")
     until(lambda: len(waits) == 2)
     recorder.close()
@@ -206,7 +205,7 @@ import json, resource, sys, time
 import numpy as np
 from rovgraph.live.warnings import Warnings
 from rovgraph.live.message import Reading
-from rovgraph.live.recorder import Recorder
+from rovgraph.live.files import Recorder
 said = []
 recorder = Recorder(sys.argv[1], Warnings(lambda *about: said.append(about)))
 _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -352,7 +351,7 @@ def test_a_checkpoint_that_fails_leaves_the_old_one_and_no_rest(tmp_path, monkey
 
 CHECKPOINTS = """
 import sys, numpy as np
-from rovgraph.live.checkpoint import write_checkpoint
+from rovgraph.live.files import write_checkpoint
 k = 0
 while True:
     k += 1

@@ -38,22 +38,20 @@ from wire import (
     vision,
 )
 
-from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.live.feed import Feed
-from rovgraph.live.files import Known
+from rovgraph.live.files import KnownSources
 from rovgraph.live.message import GEODETIC, Message, Reading
+from rovgraph.live.session import Feed
 from rovgraph.live.sources import Source, links, open_source, open_sources
+from rovgraph.live.sources.doppler import waterlinked
 from rovgraph.live.sources.json_lines import json_lines
-from rovgraph.live.sources.lines import LONGEST
 from rovgraph.live.sources.links import StandardInput
-from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
+from rovgraph.live.sources.mavlink import MavlinkDecoder, MavlinkOptions
 from rovgraph.live.sources.nmea import nmea
-from rovgraph.live.sources.preferred import PATIENCE_S
-from rovgraph.live.sources.source import LinkSource, paced
-from rovgraph.live.sources.waterlinked import waterlinked
+from rovgraph.live.sources.source import LONGEST, PATIENCE_S, LinkSource, paced
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import read_log
+from rovgraph.model.config import Config
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -651,15 +649,15 @@ def test_a_pressure_that_no_air_has_is_no_surface(heard):
 
 
 def test_a_resumed_run_goes_on_with_the_surface_of_before(heard, tmp_path):
-    known = Known(tmp_path, False, Warnings())
-    decoded(MavlinkDecoder("m", heard, Config(), Options(), known), packed(pressure2(hpa=1000.0)))
-    again = Known(tmp_path, True, Warnings())
+    known = KnownSources(tmp_path, False, Warnings())
+    decoded(MavlinkDecoder("m", heard, Config(), MavlinkOptions(), known), packed(pressure2(hpa=1000.0)))
+    again = KnownSources(tmp_path, True, Warnings())
     under_water = packed(pressure2(hpa=1000.0 + 98.0665))
-    said = decoded(MavlinkDecoder("m", heard, Config(), Options(), again), under_water)
+    said = decoded(MavlinkDecoder("m", heard, Config(), MavlinkOptions(), again), under_water)
     np.testing.assert_allclose(by_sensor(said)["depth"], [[1.0]], atol=1e-4)
     assert heard.kinds == {"surface": 1}
     (tmp_path / "sources.json").write_text("{", encoding="utf-8")
-    assert Known(tmp_path, True, Warnings()) == {}
+    assert KnownSources(tmp_path, True, Warnings()) == {}
 
 
 def test_an_imu_that_is_sent_twice_a_second_is_said_to_be_too_slow(heard):
@@ -1001,7 +999,7 @@ def test_a_live_feed_ticks_in_silence_and_ends_with_its_last_source(monkeypatch)
                 heard.wait(HANGS_S)
                 yield message
 
-    monkeypatch.setattr("rovgraph.live.feed.queue.Queue", Queue)
+    monkeypatch.setattr("rovgraph.live.session.queue.Queue", Queue)
     said = []
     for message in Feed([Silent("a", [1, 2]), Scripted("b", [3])]):
         said.append(message)
@@ -1053,7 +1051,7 @@ def test_closing_ends_the_iteration_and_the_threads():
 
 INTERRUPTED = """
 import sys
-from rovgraph.live.feed import Feed
+from rovgraph.live.session import Feed
 from rovgraph.live.sources import open_sources
 feed = Feed(open_sources(["-", "udp://:{udp}", "tcp://127.0.0.1:{tcp}"]))
 print("ready", flush=True)

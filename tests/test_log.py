@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import STREAMS, Log, Stream, read_log
+from rovgraph.model.config import Config
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 IMU = "time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z"

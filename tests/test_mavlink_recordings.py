@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recordings import close, first, read
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import read_recording, recognise
 from rovgraph.log import Log
+from rovgraph.readers.formats import read_recording, recognise
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "ardusub"
 UNIX = 1_700_000_000.0  # of the autopilot's start

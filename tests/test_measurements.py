@@ -10,9 +10,16 @@ from motions import Delta, problem_of, propagate
 from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
-from rovgraph.calibration import TABLE, calibration_size
-from rovgraph.config import Config
-from rovgraph.engine.measurements import (
+from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy
+from rovgraph.inference.graph.batch import RowPlaces, measurement_factor, measurement_keys, robust_noise
+from rovgraph.inference.graph.values import insert_calibration, insert_state, key
+from rovgraph.kernels import assembly, motion_row
+from rovgraph.kernels import measurement_row as at
+from rovgraph.model.calibration import TABLE, calibration_size
+from rovgraph.model.config import Config
+from rovgraph.model.state import DIMENSION, PLACE, PLACE_DIM, State
+from rovgraph.problem.calibration_roles import CalibrationRoles
+from rovgraph.problem.measurements import (
     KeyframeRows,
     Measurements,
     loss_and_weight,
@@ -20,18 +27,9 @@ from rovgraph.engine.measurements import (
     sensor_table,
     whitening,
 )
-from rovgraph.engine.problem import sd_of
-from rovgraph.engine.scale import scale_to_bias
-from rovgraph.engine.unknowns import Unknowns
-from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy
-from rovgraph.graph.keys import key
-from rovgraph.graph.measurement_factors import measurement_factor, measurement_keys, robust_noise
-from rovgraph.graph.rows import Rows
-from rovgraph.graph.values import insert_calibration, insert_state
-from rovgraph.instruments import instruments
-from rovgraph.kernels import assembly, motion_row
-from rovgraph.kernels import measurement_row as at
-from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State
+from rovgraph.problem.motion import scale_to_bias
+from rovgraph.problem.problem import sd_of
+from rovgraph.sensors.instruments import instruments
 
 N, STEP = 4, 1e-6
 SEGMENTS = np.arange(N) // 2
@@ -66,7 +64,7 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Meas
     problem = replace(blank, sensors=(sensor,), dims=(dim,), rows=rows, row_scales=scales, of=of, names=np.ones(N))
     if windows:
         problem = replace(problem, windows=np.array(windows), lags={sensor: LAG}, bias=state.bias.mean(axis=0))
-    return Measurements(problem, np.arange(N), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
+    return Measurements(problem, np.arange(N), instrument, 9.81, CalibrationRoles(state.calibration, WALKS)), state
 
 
 def snapshot(dt: float, dR: Array, dv: Array, dp: Array) -> Array:
@@ -89,7 +87,7 @@ def factor_of(block: Measurements, k: int) -> gtsam.CustomFactor:
     return measurement_factor(block.at([k]), int(SEGMENTS[k]))
 
 
-def values_of(state: State, unknowns: Unknowns) -> gtsam.Values:
+def values_of(state: State, unknowns: CalibrationRoles) -> gtsam.Values:
     values = gtsam.Values()
     for k in range(len(state)):
         insert_state(values, k, state.at([k]))
@@ -160,7 +158,7 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
     block, state = block_of(sensor, loss=loss)
     values = values_of(state, block.unknowns)
     pushed, custom = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows({sensor: block}, SEGMENTS).push(pushed, {sensor: block.weighted(state, np.ones(N, dtype=bool))})
+    RowPlaces({sensor: block}, SEGMENTS).push(pushed, {sensor: block.weighted(state, np.ones(N, dtype=bool))})
     for k in range(N):
         custom.push_back(factor_of(block, k).linearize(values))
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(pushed)
@@ -173,11 +171,11 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
 def test_all_sensors_of_a_keyframe_as_one_factor_are_the_same_system_without_what_is_gated():
     made = {sensor: block_of(sensor, loss="cauchy") for sensor in SENSORS if sensor != "place"}
     blocks, state = {sensor: block for sensor, (block, _) in made.items()}, made["dvl"][1]
-    values = values_of(state, Unknowns(state.calibration, WALKS))
+    values = values_of(state, CalibrationRoles(state.calibration, WALKS))
     rng = np.random.default_rng(1)
     gates = {sensor: rng.random(N) < 0.7 for sensor in blocks}
     together, apart = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows(blocks, SEGMENTS).push(
+    RowPlaces(blocks, SEGMENTS).push(
         together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()}
     )
     for sensor, block in blocks.items():
@@ -269,7 +267,7 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     assert set(problem.used) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor in problem.used:
         instrument = smoother.initial.instruments[sensor]
-        gravity, unknowns = config.environment.gravity_mps2, Unknowns(truth.calibration, {})
+        gravity, unknowns = config.environment.gravity_mps2, CalibrationRoles(truth.calibration, {})
         block = Measurements(problem, problem.of_sensor(sensor), instrument, gravity, unknowns)
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from recordings import check_dive_comes_back, check_refused_or_whole, close, first, read
 
 import rovgraph as rg
+from rovgraph.dates import gps_of_unix, unix_of_gps
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
-from rovgraph.gps_time import gps_of_unix, unix_of_gps
-from rovgraph.interchange.formats import recognise
+from rovgraph.readers.formats import recognise
 
 G = 9.80665
 WEEK, TOW = 2300, 490_025.0

@@ -14,8 +14,8 @@ from recordings import check_refused_or_whole, close, first, read
 from wire import sentence
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import read_recording, recognise
-from rovgraph.interchange.recording import Recording
+from rovgraph.readers.formats import read_recording, recognise
+from rovgraph.readers.recording import Recording
 
 MIDNIGHT = datetime(2024, 3, 2, tzinfo=UTC).timestamp()
 

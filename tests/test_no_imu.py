@@ -28,22 +28,22 @@ from scipy.stats import chi2
 
 from rovgraph.api.online import Online
 from rovgraph.cli.app import main
-from rovgraph.config import Config
 from rovgraph.dive import smooth
-from rovgraph.engine import gauss_newton
-from rovgraph.engine.assembly import assembly_of
-from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
-from rovgraph.estimators.attitude_gaps import without_attitude_gaps
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.interchange.formats import read_recording
-from rovgraph.live.startup import Startup
+from rovgraph.inference import gauss_newton
+from rovgraph.inference.attitude_gaps import without_attitude_gaps
+from rovgraph.inference.chain_optimum import smooth_chain
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.live.intake import Startup
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import frozen_stretches
+from rovgraph.model.config import Config
+from rovgraph.problem.assembly import assembly_of
+from rovgraph.readers.formats import read_recording
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import known
-from rovgraph.trajectory import Trajectory
 
 REMUS = Path(__file__).parents[2] / "shared" / "data" / "remus600_pd0" / "adcp.adc.gz"
 CONFIG = Path(__file__).parents[1] / "configs" / "remus600.yaml"
@@ -362,7 +362,7 @@ def test_gtsam_finds_the_same_optimum(dive, monkeypatch):
     pytest.importorskip("gtsam")
     for tolerance in ("FINE", "REST"):
         monkeypatch.setattr(gauss_newton, tolerance, 1e-11)
-    from rovgraph.graph.places import smooth_graph
+    from rovgraph.inference.graph.places import smooth_graph
 
     case, config = dive
     smoother = batch(case.log, config)

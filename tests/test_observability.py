@@ -9,30 +9,28 @@ import numpy as np
 import pytest
 from dives import batch, changed, exact, kept, simulated, true_at
 
-from rovgraph.calibration import TABLE
 from rovgraph.cli import app
-from rovgraph.config import Config
-from rovgraph.engine.filter import FilterEngine
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.reinitialisation import reinitialised
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.observability import (
+from rovgraph.inference.error_state import reinitialised
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.graph.batch import make_graph, make_values
+from rovgraph.inference.graph.values import key
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.observability import (
     UNOBSERVABLE,
     UNOBSERVABLE_ABOVE,
     data_information,
     relative_covariance,
     without_spurious_information,
 )
-from rovgraph.graph.batch import make_graph, make_values
-from rovgraph.graph.keys import key
+from rovgraph.lab.choices import goals, read_known
+from rovgraph.lab.observability import examined, in_words, observe, solved
+from rovgraph.lab.plan import KnownComponents, Manoeuvre, SensorRates, manoeuvres, plan, predicted
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config
+from rovgraph.model.state import State
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
 from rovgraph.simulate.files import write_log
-from rovgraph.state import State
-from rovgraph.studies.choices import goals, read_known
-from rovgraph.studies.directions import in_words
-from rovgraph.studies.manoeuvres import Manoeuvre, manoeuvres
-from rovgraph.studies.observability import examined, observe, solved
-from rovgraph.studies.plan import Known, Sensors, plan, predicted
 
 CALMLY = Style(waves=CALM)
 ONE_COMPASS = changed(exact(Config()), calibration={"dvl_yaw": {"estimate": True}}, heading={"sources": ["ahrs"]})
@@ -227,7 +225,7 @@ def test_components_by_themselves_are_as_sure_as_among_the_others(straight):
 def test_a_plan_predicts_what_noisy_dives_show():
     config = changed(UNBIASED, calibration={"ahrs_deviation": {"estimate": False}})
     one = Manoeuvre("accelerate-and-stop", 0.4)
-    expected = predicted(one, config, 60.0, Sensors(50.0, 4.0))
+    expected = predicted(one, config, 60.0, SensorRates(50.0, 4.0))
     path = scenario(one.name, 60.0, one.speed, CALMLY)
     sd = []
     for seed in range(4):
@@ -239,7 +237,7 @@ def test_a_plan_predicts_what_noisy_dives_show():
 
 def test_what_is_known_before_counts_once():
     sd = np.deg2rad([5.0, 3.0])
-    known = Known(("ahrs_offset", "dvl_yaw"), np.diag((0.5 * sd) ** 2), sd)
+    known = KnownComponents(("ahrs_offset", "dvl_yaw"), np.diag((0.5 * sd) ** 2), sd)
     own = known.information(("dvl_yaw", "dvl_scale"), np.array([sd[1], 0.01]))
     np.testing.assert_allclose(own, np.diag([3.0, 0.0]), atol=1e-9)  # half the sd is four times the information
 
@@ -369,7 +367,9 @@ def test_a_file_that_is_no_report_is_refused(tmp_path):
 
 def test_a_goal_for_what_is_held_is_refused():
     with pytest.raises(InputError, match="goal dvl_scale: it is not estimated"):
-        plan(ONE_COMPASS, [Manoeuvre("straight", 0.4)], 40.0, goals={"dvl_scale": 0.001}, sensors=Sensors(50.0, 4.0))
+        plan(
+            ONE_COMPASS, [Manoeuvre("straight", 0.4)], 40.0, goals={"dvl_scale": 0.001}, sensors=SensorRates(50.0, 4.0)
+        )
 
 
 def test_open_directions_are_told_apart_and_each_once():

@@ -23,6 +23,7 @@ from wire import packed, report
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
@@ -30,7 +31,6 @@ from rovgraph.live.session import Session
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import read_log
 from rovgraph.simulate.files import write_dive
-from rovgraph.trajectory import Trajectory
 
 ONLINE = [sys.executable, "-c", "from rovgraph.cli.app import main; main()", "online"]
 START_S = 60.0  # longest wait for the program, on a busy machine
@@ -306,7 +306,7 @@ class Full:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, navigator: Navigator, begin: float, end: float) -> None:
         self._write, self._csv, self._navigator, self._span = os.write, Trajectory.write_csv, navigator, (begin, end)
         self.refused = 0
-        monkeypatch.setattr("rovgraph.live.recorder.os.write", self.write)
+        monkeypatch.setattr("rovgraph.live.files.os.write", self.write)
         monkeypatch.setattr(Trajectory, "write_csv", lambda t, path, more=False, _=None: self.csv(t, path, more))
 
     def _check(self) -> None:

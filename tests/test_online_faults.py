@@ -12,10 +12,9 @@ import pytest
 from dives import Simulated, as_log, changed, falcon, simulated, true_at, without
 from live import Flight, flown, message, navigator, turned
 
-from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.estimators.eskf.fixed_lag import FixedLag
-from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.graph.isam2 import IncrementalEstimator
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.files import Files
 from rovgraph.live.intake import Intake
@@ -24,6 +23,7 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, Measurement, Stream
+from rovgraph.model.config import Config
 from rovgraph.simulate import simulated as by_name
 
 AT = 20.0  # when something fails

@@ -15,19 +15,19 @@ import pandas as pd
 import pytest
 from dives import Simulated, altered, batch, falcon, incremental, renewed, simulated, started
 
-from rovgraph.calibration import TABLE, calibration_size
-from rovgraph.check import examine
-from rovgraph.config import Config, describe, parse_config
+from rovgraph.diagnosis.check import examine
 from rovgraph.errors import InputError
-from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.geometry import exp_rotation
-from rovgraph.instruments import instruments
+from rovgraph.inference.estimate import CalibrationEstimate, Estimate
+from rovgraph.live.files import Recorder
 from rovgraph.live.message import readings
-from rovgraph.live.recorder import Recorder
 from rovgraph.log import STREAMS, read_log
+from rovgraph.model.calibration import TABLE, calibration_size
+from rovgraph.model.config import Config, describe, parse_config
+from rovgraph.model.state import POSE, State
 from rovgraph.sensors import SENSORS, Column, Sensor, register, unregister
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate.files import write_dive
-from rovgraph.state import POSE, State
 
 PAGE = (Path(__file__).parents[1] / "docs" / "own-sensor.md").read_text(encoding="utf-8")
 MODULE, SCRIPT = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -12,14 +12,11 @@ import pytest
 import rovgraph as rg
 from rovgraph.api.reporting import report
 from rovgraph.log.beams import usable_beams
-from rovgraph.pages.beams import valid_share
-from rovgraph.pages.page import render
-from rovgraph.pages.parts import Panel, Section, line, packed
-from rovgraph.pages.reporting import page_of
-from rovgraph.pages.sensors import autocorrelation
-from rovgraph.pages.source import Track
-from rovgraph.pages.thinning import broken, extremes
-from rovgraph.pages.uncertainty import falls, separation
+from rovgraph.report.pages.page import Panel, Section, broken, extremes, line, packed, render
+from rovgraph.report.pages.reporting import page_of
+from rovgraph.report.pages.sensors import autocorrelation, valid_share
+from rovgraph.report.pages.source import PageTrack
+from rovgraph.report.pages.uncertainty import falls, separation
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & <b>δύτης 潜水</b>"
 LIMIT = 6_000_000  # bytes of a page
@@ -420,7 +417,7 @@ def test_separation_of_two_estimates_that_share_their_data_has_unit_variance():
             V.insert(0, Ps[k] + G**2 * (V[0] - Ps[k] - q))
         time = np.arange(n, dtype=float)
         tracks = [
-            Track(kind, {"time": time, "down": np.array(m), "down_sd": np.sqrt(v)})
+            PageTrack(kind, {"time": time, "down": np.array(m), "down_sd": np.sqrt(v)})
             for kind, m, v in (("filtered", means, Ps), ("smoothed", later, V))
         ]
         seen.append(separation(*tracks, "down")[1])

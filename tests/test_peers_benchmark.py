@@ -15,10 +15,10 @@ from fault_campaign.instruments import log_table, sample
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
 
-from rovgraph.config import Config
-from rovgraph.evaluate import evaluate
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab.evaluate import evaluate
 from rovgraph.log import Log
-from rovgraph.trajectory import Trajectory
+from rovgraph.model.config import Config
 
 TURNED_DEG, SECONDS = 3.0, 60.0
 

@@ -23,32 +23,29 @@ from dives import (
 )
 from scipy.stats import chi2
 
-from rovgraph.check import examine
-from rovgraph.config import Config
-from rovgraph.engine.assembly import assembly_of
-from rovgraph.engine.optimum import OTHERS
+from rovgraph.diagnosis.check import examine
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
-from rovgraph.estimators.eskf.fixed_lag import FixedLag
-from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
-from rovgraph.graph.keys import calibration_key, key, key_name
-from rovgraph.graph.marginals import covariances, marginals
-from rovgraph.graph.optimum import GraphOptimum
-from rovgraph.graph.places import matched
+from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.graph.optimum import GraphOptimum, covariances, marginals
+from rovgraph.inference.graph.places import matched
+from rovgraph.inference.graph.values import calibration_key, key, key_name
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.optimum import OTHERS
 from rovgraph.kernels.measurement_row import TIME
-from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
+from rovgraph.live.files import Recorder, read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
-from rovgraph.live.recorder import Recorder
 from rovgraph.live.sources.json_lines import JsonRow
 from rovgraph.log import Log, read_log
 from rovgraph.log.streams import label_number
+from rovgraph.model.config import Config
+from rovgraph.problem.assembly import assembly_of
 from rovgraph.simulate import Choices, Truth, scenario, simulate
 from rovgraph.simulate import simulated as by_name
 from rovgraph.simulate.files import known, write_log
-from rovgraph.simulate.path import Style, path_along
-from rovgraph.simulate.route import Route
+from rovgraph.simulate.path import Route, Style, path_along
 
 SD = 0.2
 SIDE, SPEED, LAPS = 30.0, 0.4, 4  # a square of 20 minutes

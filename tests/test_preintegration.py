@@ -7,18 +7,18 @@ import pytest
 from dives import LIVELY, altered, as_log, batch, changed, falcon, fed, kept, level_log, simulated
 from motions import predict
 
-from rovgraph.config import Config, parse_config
-from rovgraph.engine.preintegration import preintegrate, preintegration_params, scatter
 from rovgraph.errors import InputError
-from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, earth_rate_n, exp_rotation, log_rotation, rpy_from_matrix
+from rovgraph.inference.graph.isam2 import IncrementalEstimator
+from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row, motion_row
-from rovgraph.kernels.coasting import BRIDGE_GYR
-from rovgraph.kernels.imu_samples import typical_scatter
+from rovgraph.kernels.motion import BRIDGE_GYR
+from rovgraph.kernels.preintegration import typical_scatter
+from rovgraph.model.config import Config, parse_config
+from rovgraph.model.state import State
+from rovgraph.problem.motion import preintegrate, preintegration_params, scatter
 from rovgraph.simulate import Path, scenario
-from rovgraph.simulate.imu import specific_force_and_rate
-from rovgraph.state import State
+from rovgraph.simulate.dive import specific_force_and_rate
 
 START, END = 31.0, 36.0
 ARM = (-0.4, 0.3, 0.2)

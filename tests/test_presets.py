@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rovgraph.cli.config import preset_tables
-from rovgraph.config import Config, describe, load_config, parse_config
-from rovgraph.config.presets import TRIPLES, UNITS, Preset, presets
+from rovgraph.cli.logs import preset_tables
 from rovgraph.errors import DataWarning, InputError
+from rovgraph.model.config import Config, describe, load_config, parse_config
+from rovgraph.model.presets import TRIPLES, UNITS, Preset, presets
 
 ROOT = Path(__file__).parents[1]
 

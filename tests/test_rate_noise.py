@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from dives import batch, falcon, interrupted, simulated, started
 
-from rovgraph.dive import Dive, smooth
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import COARSE
-from rovgraph.engine.optimum import NEWEST, estimated_parts
-from rovgraph.engine.rate_noise import ARM, spurious_information
-from rovgraph.engine.released import release
-from rovgraph.estimators.observability import OBSERVABLE_BELOW, relative_sd, shown
+from rovgraph.dive import DiveEstimates, smooth
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.gauss_newton import COARSE
+from rovgraph.inference.lever_arm_bias import ARM, spurious_information
+from rovgraph.inference.observability import OBSERVABLE_BELOW, relative_sd, shown
+from rovgraph.inference.optimum import NEWEST, estimated_parts
+from rovgraph.inference.score_test import score_test
+from rovgraph.lab.observability import observe
 from rovgraph.simulate.path import Style
-from rovgraph.studies.observability import observe
 
 CALM = Style()  # no waves
 SEEDS = range(1, 9)
@@ -55,7 +55,7 @@ def test_least_squares_draws_the_arm_to_zero_as_far_as_is_said(seed):
 def test_a_released_arm_is_right_without_what_is_spurious():
     steps: dict[str, list[float]] = {label: [] for label in calm(1).beliefs[ARM].variable.labels}
     for seed in SEEDS:
-        for one in release(calm(seed), [ARM]):
+        for one in score_test(calm(seed), [ARM]):
             steps[one.label].append(one.step / one.sd)
     for values in steps.values():
         assert len(values) == len(SEEDS) and NEAR < np.mean(np.square(values)) < FAR
@@ -99,7 +99,7 @@ def test_the_score_is_the_derivative_of_the_cost():
 def test_nothing_is_said_of_an_arm_whose_information_is_mostly_spurious():
     best = calm(1, NOISY)
     shares = spurious_information(best).share(least_squares_sd(best))
-    assert len(release(best, [ARM])) == (shares < 0.5).sum() < 3
+    assert len(score_test(best, [ARM])) == (shares < 0.5).sum() < 3
 
 
 def test_an_arm_that_noise_moves_stays_considered_though_least_squares_shows_it():
@@ -135,7 +135,7 @@ def test_observe_knows_what_is_spurious():
     assert len(sds) == 3 and sds["dvl_lever_arm_z"] > 0.7
 
 
-def moved_by_noise(offset: float, estimate: bool | str = "considered") -> Dive:
+def moved_by_noise(offset: float, estimate: bool | str = "considered") -> DiveEstimates:
     """A dive without waves whose gyro's noise would move the arm's z, its DVL to starboard of where it is stated."""
     config = falcon(calibration={ARM: {"estimate": estimate}}, imu={"noise": {"gyr": 1.5e-3}})
     case = simulated(config, 90.0, seed=2, style=CALM, calibration={ARM: [0.0, offset, 0.0]})

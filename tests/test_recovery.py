@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, falcon, initial_conditions, interrupted, renewed, simulated, true_at
 
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.problem import Problem
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.smoother import assemble
 from rovgraph.geometry import Array
-from rovgraph.kernels.error_coordinates import ErrorLayout
-from rovgraph.kernels.filter_state import FilterState
-from rovgraph.kernels.moves import difference, move_estimate
-from rovgraph.state import VELOCITY
+from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter_step import Gaussian
+from rovgraph.inference.smoother import assemble
+from rovgraph.kernels.error_coordinates import ErrorColumns
+from rovgraph.kernels.filter_state import FilterState, local_coordinates, move_estimate
+from rovgraph.model.state import VELOCITY
+from rovgraph.problem.problem import Problem
 
 SILENT_FROM = 40.0
 
@@ -95,17 +94,17 @@ def about_to_return(case: Simulated, rng: np.random.Generator) -> tuple[FilterEn
     return engine, Gaussian(off.x, off.c, known.P), problem, ping
 
 
-def along_n(engine: FilterEngine) -> ErrorLayout:
+def along_n(engine: FilterEngine) -> ErrorColumns:
     """The error's coordinates with the velocity along n."""
     columns, seen, params, rows = engine.layout.coordinates
     others = seen[:, 2] != engine.layout.columns[VELOCITY].start
-    return ErrorLayout(columns, seen[others], params[others], rows)
+    return ErrorColumns(columns, seen[others], params[others], rows)
 
 
 def from_optimum(engine: FilterEngine, known: Gaussian, there: Gaussian, problem: Problem, ping: int) -> float:
     """The largest component of a Newton step from an estimate, in its sds."""
     back, basis = np.empty(engine.layout.size), np.eye(engine.layout.size)
-    difference(there.x, there.c, known.x, known.c, along_n(engine), back, basis)
+    local_coordinates(there.x, there.c, known.x, known.c, along_n(engine), back, basis)
     r, H = engine.linearize(there, problem, np.array([ping]))
     P = basis @ known.P @ basis.T
     step = P @ H.T @ np.linalg.solve(H @ P @ H.T + np.eye(len(r)), r - H @ back) + back

@@ -16,17 +16,16 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from rovgraph.config import Config, load_config
 from rovgraph.errors import InputError
-from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.geometry import matrix_from_rpy
+from rovgraph.inference.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
+from rovgraph.inference.trajectory import Trajectory, read_trajectory
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.model.config import Config, load_config
 from rovgraph.report.folder import check_writable, results_folder
-from rovgraph.report.narrow import fitting
 from rovgraph.report.results import Remarks, ellipse_axes, sensor_counts, summarise, to_plain, write_results
-from rovgraph.report.tables import calibration_table, summary_table
+from rovgraph.report.tables import calibration_table, fitting, summary_table
 from rovgraph.report.units import plus_minus
-from rovgraph.trajectory import Trajectory, read_trajectory
 
 DEG = np.deg2rad(1.0)
 START = 1.6e9  # an epoch of today's clocks, where float digits begin to matter
@@ -477,7 +476,7 @@ def test_drawn_ellipse_lies_along_the_covariance(dive):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import EllipseCollection
 
-    from rovgraph.report.figure_track import draw_track
+    from rovgraph.report.figures import draw_track
     from rovgraph.report.style import style
 
     estimates, log, config, _ = dive
@@ -531,7 +530,7 @@ def test_figures_of_bare_estimates(dive, tmp_path):
 
 
 def test_a_poorly_known_start_does_not_flatten_the_axes_of_velocity(dive):
-    from rovgraph.report.figure_motion import draw_velocity
+    from rovgraph.report.figures import draw_velocity
 
     track = dive[0][1].trajectory
     cov_v = track.cov_v.copy()
@@ -545,7 +544,7 @@ def test_a_poorly_known_start_does_not_flatten_the_axes_of_velocity(dive):
 
 
 def test_depth_grows_downwards_and_the_bottom_lies_below_it_by_the_altitude(dive):
-    from rovgraph.report.figure_motion import draw_depth
+    from rovgraph.report.figures import draw_depth
 
     estimates, log, _, _ = dive
     time = log["imu"].time[::50]
@@ -588,7 +587,7 @@ def test_thinning_keeps_both_ends():
 
 def test_compass_headings_are_brought_to_the_body(dive):
     """Mountings and declination are taken off; what remains is the compass's own error."""
-    from rovgraph.report.figure_motion import heading_samples
+    from rovgraph.report.figures import heading_samples
 
     _, log, config, reference = dive
     samples = heading_samples(reference, log, config)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from dives import falcon
 
-from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import exp_rotation, skew
+from rovgraph.inference.estimate import body_trajectory
 from rovgraph.kernels.assembly import KEYFRAME, RATE_B, SPREAD, TIME
-from rovgraph.state import State
+from rovgraph.model.state import State
 
 ARM_B = np.array([2.0, -2.0, 1.0])  # 3 m
 N, DRAWS = 4, 40_000
@@ -31,7 +31,7 @@ def published():
     initial = SimpleNamespace(config=config, beliefs={}, streams=())
     states = State(R_nb, p_n, v_n, bias, {})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rovgraph.estimators.results.rests_on_doubtful_compass", lambda initial: False)
+        patch.setattr("rovgraph.inference.estimate.rests_on_doubtful_compass", lambda initial: False)
         track = body_trajectory(keyframes, states, initial, cov_pose, cov_v)
     return states, rate_b, rate_sd, cov_pose, cov_v, track
 

@@ -8,8 +8,8 @@ from bags import START, Sent, write
 from recordings import close
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import read_recording
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.readers.formats import read_recording
+from rovgraph.readers.recording import Channel, Recording
 
 
 def packet(time: float, kind: str, topic: str, boot: float | None = None, **fields: object) -> Sent:

@@ -15,9 +15,9 @@ from recordings import close, first
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
-from rovgraph.interchange.formats import Options, read_recording, recognise
-from rovgraph.interchange.recording import Recording
 from rovgraph.log import Log
+from rovgraph.readers.formats import ReadingOptions, read_recording, recognise
+from rovgraph.readers.recording import Recording
 
 FLU = np.diag([1.0, -1.0, -1.0])
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -29,7 +29,7 @@ def bag(folder: Path, *sent: Any, form: str = "ros1", **more: Any) -> Path:
 
 
 def read(folder: Path, *sent: Any, form: str = "ros1", choose: Any = None, **more: Any) -> Recording:
-    return read_recording(bag(folder, *sent, form=form, **more), Options(choose=choose or {}))
+    return read_recording(bag(folder, *sent, form=form, **more), ReadingOptions(choose=choose or {}))
 
 
 def left(recording: Recording) -> dict[str, int]:
@@ -197,7 +197,7 @@ def test_a_velocity_of_no_dvl_is_one_only_if_it_is_chosen(tmp_path):
     assert not any(channel.sensor == "dvl" for channel in recording.channels)
     (told,) = [w for w in recording.warnings if w.startswith("no DVL in the bag; its topics: ")]
     assert "/imu/data (sensor_msgs/msg/Imu), /velocity (geometry_msgs/msg/TwistWithCovarianceStamped)" in told
-    chosen = read_recording(path, Options(choose={"dvl": "/velocity"}))
+    chosen = read_recording(path, ReadingOptions(choose={"dvl": "/velocity"}))
     close(first(chosen, "dvl").columns["dvl_sd"], 0.01)
     assert chosen.settings["dvl"]["mount_rpy_deg"] == [180.0, 0.0, 0.0]
 

@@ -13,7 +13,6 @@ import pytest
 from dives import falcon, level_log
 from scipy.stats import chi2, norm
 
-from rovgraph.calibration import TABLE
 from rovgraph.diagnosis import (
     RULES,
     Evidence,
@@ -25,18 +24,19 @@ from rovgraph.diagnosis import (
     find_alarms,
     motion,
     residuals,
-    sensors,
-    stretches,
     verdict_of,
 )
+from rovgraph.diagnosis import motion as stretches
+from rovgraph.diagnosis import residuals as sensors
 from rovgraph.diagnosis.alarm import Alarm, alarm_of
 from rovgraph.diagnosis.evidence import SensorResiduals
-from rovgraph.engine.gauss_newton import Stretch
-from rovgraph.engine.released import Released
-from rovgraph.estimators.estimate import CalibrationEstimate, Estimate, History
 from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
+from rovgraph.inference.estimate import CalibrationEstimate, Estimate, History
+from rovgraph.inference.gauss_newton import FaultyInterval
+from rovgraph.inference.score_test import ScoreTest
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.model.calibration import TABLE
 from rovgraph.rules import BELIEVED_SDS, CHANCE, COMPARISONS, comparison_table, remedy_of_lag, rule_table
-from rovgraph.trajectory import Trajectory
 
 ALARMS = Path(__file__).parents[1] / "docs" / "alarms.md"
 START, SECONDS, RATE = 1000.0, 300, 10  # of the dives here [s, s, Hz]
@@ -290,7 +290,7 @@ def test_lasting_of_one_window_is_said_of_that_window(limit, times, severity):
     ratio = figure_of("lasting", limit, times)
     here = (TIME > START + 150.0) & (TIME < START + 155.0)
     normalised = np.where(here, sqrt(residuals.OF_ONE * ratio / here.sum()), 0.0)
-    (one,) = residuals.lasting(evidence(frame("depth", TIME, normalised, np.ones(N))))
+    (one,) = residuals.correlated_residuals(evidence(frame("depth", TIME, normalised, np.ones(N))))
     assert (one.figure, one.severity, span_of(one)) == (pytest.approx(ratio), severity, (150.0, 155.0))
 
 
@@ -300,7 +300,7 @@ def test_lasting_of_all_windows_of_a_length(limit, times, severity, seconds):
     ratio, count = figure_of("lasting", limit, times), seconds * RATE
     sign = (-1.0) ** ((TIME - START) // seconds)
     normalised = sign * sqrt(ratio / count)  # of the shorter length it cancels in the longer one
-    one = next(residuals.lasting(evidence(frame("depth", TIME, normalised, np.ones(N)))))
+    one = next(residuals.correlated_residuals(evidence(frame("depth", TIME, normalised, np.ones(N)))))
     assert f"means over {seconds:g} s" in one.cause
     assert (one.figure, one.severity) == (pytest.approx(ratio), severity)
     assert one.end - one.begin == seconds
@@ -310,7 +310,7 @@ def test_lasting_allows_for_what_measurements_share():
     here = (TIME > START + 150.0) & (TIME < START + 155.0)
     normalised = np.where(here, sqrt(residuals.OF_ONE * 8.0 / here.sum()), 0.0)[:, None]
     r = SensorResiduals("depth", ("down",), TIME, normalised, np.ones(N), np.full((N, 1), 1.0 / here.sum()))
-    (one,) = residuals.lasting_in(r, START, END)
+    (one,) = residuals.correlated_residuals_in(r, START, END)
     assert one.figure == pytest.approx(8.0 / 2.0)
 
 
@@ -323,10 +323,10 @@ def test_estimates_are_compared_where_they_differ_most(what, limit, times, sever
     square, s = figure_of("estimates", limit, times), track(sd=0.02)
     off = np.where(s.time == START + 200.0, sqrt(square * 2.0) * 0.02, 0.0)  # of two tracks as uncertain
     f = differing(s, what, off)
-    said = [one for one in motion.apart(s, f, START) if one.kind == "estimates" and what in one.cause]
+    said = [one for one in motion.separation_of(s, f, START) if one.kind == "estimates" and what in one.cause]
     assert [(one.figure, one.severity) for one in said] == [(pytest.approx(square), severity)]
     assert span_of(said[0]) == (200.0, 200.0)
-    assert all(one.severity is None for one in motion.apart(s, f, START) if one.kind == "separation")
+    assert all(one.severity is None for one in motion.separation_of(s, f, START) if one.kind == "separation")
 
 
 @levels
@@ -335,7 +335,7 @@ def test_separation_is_of_the_whole_dive(what, limit, times, severity):
     square, s = figure_of("separation", limit, times), track(sd=0.02)
     axes = 2.0 if what == "position" else 1.0
     f = differing(s, what, np.full(len(s), sqrt(square * axes) * 0.02))
-    said = [one for one in motion.apart(s, f, START) if one.kind == "separation" and what in one.cause]
+    said = [one for one in motion.separation_of(s, f, START) if one.kind == "separation" and what in one.cause]
     assert [(one.figure, one.severity) for one in said] == [(pytest.approx(square), severity)]
     assert span_of(said[0]) == (0.0, SECONDS)
 
@@ -349,7 +349,7 @@ def differing(s: Trajectory, what: str, off: Array) -> Trajectory:
 def test_a_filter_that_settles_is_not_compared():
     s = track(sd=0.02)
     f = moved_by(s, 0, np.where(s.time < START + motion.SETTLED_S, 100.0, 0.0))
-    assert all(one.figure == 0.0 for one in motion.apart(s, f, START))
+    assert all(one.figure == 0.0 for one in motion.separation_of(s, f, START))
 
 
 @lower
@@ -357,7 +357,7 @@ def test_found_is_the_rms_by_which_the_track_moved_in_its_sds(limit, times, seve
     figure, t = figure_of("found", limit, times), track(sd=2.0)
     off = np.full(len(t), sqrt(2.0) * 2.0 * figure)
     off[200] *= 1.0 + 1e-5
-    (one,) = motion.found(evidence(t=t, before=moved_by(t, 1, off), revealed=[("fix", "its errors last")]))
+    (one,) = motion.found_noise(evidence(t=t, before=moved_by(t, 1, off), revealed=[("fix", "its errors last")]))
     assert (one.sensor, one.figure, one.severity) == ("fix", pytest.approx(figure, rel=1e-4), severity)
     assert span_of(one) == (200.0, 200.0)
 
@@ -401,7 +401,7 @@ def test_imu_by_the_variance_of_its_means(column, said, limit, times, severity, 
     ratio, r = figure_of("imu", limit, times), np.zeros((600, 15))
     r[:, column] = sqrt(ratio / 40.0)  # 40 motions in 20 s
     r[280:320, column] *= 1.0 + 1e-5
-    (one,) = [one for one in motion.imu(of_motions(r, monkeypatch)) if one.figure > 0.0]
+    (one,) = [one for one in motion.imu_disagreement(of_motions(r, monkeypatch)) if one.figure > 0.0]
     assert one.cause.startswith(f"{said} contradicts")
     assert (one.figure, one.severity, span_of(one)) == (pytest.approx(ratio, rel=1e-5), severity, (140.0, 160.0))
 
@@ -480,12 +480,12 @@ def test_held_by_the_step_of_a_released_constant(considered, limit, times, sever
     allowed = hypot(sd, feigned, prior_sd if considered else 0.0)
     figure = times * (RULES["moved"].wrong if considered and limit == "wrong" else getattr(RULES["held"], limit))
     step = -figure * allowed
-    hardly_seen = Released("dvl_roll", "dvl_roll", 99.0, 1.01 * constants.SHOWN * TABLE["dvl_roll"].sd)
-    monkeypatch.setattr(constants, "release", lambda *_: [Released("dvl_scale", "dvl_scale", step, sd), hardly_seen])
+    hardly_seen = ScoreTest("dvl_roll", "dvl_roll", 99.0, 1.01 * constants.SHOWN * TABLE["dvl_roll"].sd)
+    monkeypatch.setattr(constants, "release", lambda *_: [ScoreTest("dvl_scale", "dvl_scale", step, sd), hardly_seen])
     belief = SimpleNamespace(mean=np.zeros(1), sd=prior_sd)
     unknowns = SimpleNamespace(considered=("dvl_scale",) if considered else ())
     best: Any = SimpleNamespace(state=track(), beliefs={"dvl_scale": belief}, unknowns=unknowns)
-    (one,) = constants.held_in(best, falcon(), 0.01, START, END)
+    (one,) = constants.contradicted_constants_in(best, falcon(), 0.01, START, END)
     assert (one.sensor, one.figure, one.severity) == ("dvl", pytest.approx(figure), severity)
     assert span_of(one) == (0.0, SECONDS)
 
@@ -500,7 +500,7 @@ def test_halves_by_the_filter_at_half_the_dive(limit, times, severity):
     seen = evidence()
     smoothed = replace(seen.estimates[0], calibration=[constant(0.5, sd=0.1)])
     seen = replace(seen, estimates=[smoothed, replace(seen.estimates[1], history={"dvl_scale": history})])
-    (one,) = constants.halves(seen)
+    (one,) = constants.split_half_drift(seen)
     assert (one.figure, one.severity, span_of(one)) == (pytest.approx(off / spread), severity, (0.0, SECONDS))
 
 
@@ -514,7 +514,7 @@ def test_frozen_by_its_seconds_in_all(limit, times, severity):
     assert (one.severity, span_of(one)) == (severity, (60.0, 60.0 + seconds))
     stretches_ = [(100.0, 100.0 + 0.5 * seconds, False), (150.0, 190.0, True), (200.0, 200.0 + 0.5 * seconds, False)]
     frozen = [SimpleNamespace(sensor="dvl", first=START + a, last=START + b, single=c) for a, b, c in stretches_]
-    (one,) = sensors.frozen(evidence(frozen=frozen))
+    (one,) = sensors.frozen_sensors(evidence(frozen=frozen))
     assert (one.severity, span_of(one)) == (severity, (100.0, 200.0 + 0.5 * seconds))
 
 
@@ -538,7 +538,7 @@ def test_findings_that_the_data_are_wrong_count_unless_they_are_mended():
         finding("depth", "jump", True, "its clock was set"),
         finding("dvl", "lag", True, "is late"),
     ]
-    said = list(sensors.checked(evidence(findings=findings, initial=initial)))
+    said = list(sensors.findings_of_check(evidence(findings=findings, initial=initial)))
     assert [(one.sensor, one.cause, one.severity) for one in said] == [
         ("dvl", "its axes are swapped", "doubtful"),
         ("dvl", "is late", "doubtful"),
@@ -588,16 +588,18 @@ def test_what_does_not_measure_the_same_at_the_same_time_is_no_contradiction(oth
 
 @pytest.mark.parametrize(("seconds", "severity"), [(0.0, None), (0.1, "doubtful"), (250.0, "doubtful")])
 def test_any_time_that_was_taken_out_is_doubtful(seconds, severity):
-    one = stretches.taken_out_in(Stretch("dvl", START + 40.0, START + 40.0 + seconds), START)
+    one = stretches.excluded_interval(FaultyInterval("dvl", START + 40.0, START + 40.0 + seconds), START)
     assert (one.severity, span_of(one)) == (severity, (40.0, 40.0 + seconds))
 
 
 @pytest.mark.parametrize(("more", "severity"), [(0.01, None), (-0.01, "doubtful")])
 def test_a_choice_is_close_by_its_likelihood(more, severity):
     margin = -np.log(RULES["close"].doubtful) + more
-    (one,) = stretches.close(evidence(optimum=SimpleNamespace(solution=SimpleNamespace(runner_up=margin))))
+    (one,) = stretches.ambiguous_optimum(evidence(optimum=SimpleNamespace(solution=SimpleNamespace(runner_up=margin))))
     assert (one.severity, span_of(one)) == (severity, (0.0, SECONDS))
-    assert not list(stretches.close(evidence(optimum=SimpleNamespace(solution=SimpleNamespace(runner_up=inf)))))
+    assert not list(
+        stretches.ambiguous_optimum(evidence(optimum=SimpleNamespace(solution=SimpleNamespace(runner_up=inf))))
+    )
 
 
 def test_the_worst_of_a_kind_and_sensor_is_said_with_its_own_time():

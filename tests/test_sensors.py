@@ -6,13 +6,13 @@ import numpy as np
 import pint
 import pytest
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, parse_config
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate, transpose, wrap_angle
-from rovgraph.instruments import instruments
 from rovgraph.log.units import UNITS
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, parse_config
+from rovgraph.model.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
 from rovgraph.sensors import field_direction, innovation
-from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
+from rovgraph.sensors.instruments import instruments
 
 CONFIG = parse_config(
     """

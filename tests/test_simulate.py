@@ -10,14 +10,14 @@ import pytest
 from dives import exact as exactly
 
 from rovgraph.cli.app import main
-from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import earth_rate_n, exp_rotation, log_rotation, rotate, transpose, wrap_angle
-from rovgraph.instruments import instruments
+from rovgraph.model.config import Config, beliefs, parse_config
+from rovgraph.model.state import State
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate import CALM, SCENARIOS, Path, Style, Truth, Waves, scenario, simulate
-from rovgraph.simulate.imu import specific_force_and_rate
-from rovgraph.simulate.route import Route, courses
-from rovgraph.state import State
+from rovgraph.simulate.dive import specific_force_and_rate
+from rovgraph.simulate.path import Route, courses
 
 ROUGH = Style(waves=Waves(heave=0.1, roll=0.3, pitch=0.2))
 MOUNTED = """

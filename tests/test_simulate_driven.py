@@ -7,20 +7,29 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from rovgraph.config import load_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import cross, rotate, transpose
-from rovgraph.instruments import hydrodynamics
 from rovgraph.log import Log
+from rovgraph.model.config import load_config
+from rovgraph.model.thesis import END_N, R_MTI, WAVE_HZ
+from rovgraph.sensors.instruments import hydrodynamics
 from rovgraph.simulate import Choices, Dive, Path, falcon, simulated
-from rovgraph.simulate.autopilot import AXES, Autopilot, VelocityControl, hold
-from rovgraph.simulate.driven import CONTROL_S, STEP_S, Craft, _Lag, drive
-from rovgraph.simulate.driven_scenarios import RUNS
-from rovgraph.simulate.route import Route
+from rovgraph.simulate.driven import (
+    AXES,
+    CONTROL_S,
+    RUNS,
+    STEP_S,
+    Autopilot,
+    Craft,
+    VelocityControl,
+    World,
+    _Lag,
+    drive,
+    hold,
+)
+from rovgraph.simulate.environment import STILL, Sea, drawn_sea
+from rovgraph.simulate.path import Route
 from rovgraph.simulate.scenario import VATTERN
-from rovgraph.simulate.sea import STILL, Sea, drawn_sea
-from rovgraph.simulate.worlds import World
-from rovgraph.thesis import END_N, R_MTI, WAVE_HZ
 
 CONFIG = falcon()
 VEHICLE = hydrodynamics(CONFIG)

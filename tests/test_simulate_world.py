@@ -9,18 +9,18 @@ import pytest
 from scipy.signal import periodogram
 
 from rovgraph.cli.app import main
-from rovgraph.config import beliefs, load_config, with_priors_stated
 from rovgraph.geometry import rotate, transpose, wrap_angle
-from rovgraph.instruments import instruments
 from rovgraph.log import Log, read_log
+from rovgraph.model.config import beliefs, load_config, with_priors_stated
+from rovgraph.model.state import State
+from rovgraph.model.thesis import R_DVL, R_MTI, WAVE_HZ
 from rovgraph.sensors import field_direction
+from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate import NAMES, Choices, Truth, falcon, lake, scenario, simulate, simulated
+from rovgraph.simulate.dive import specific_force_and_rate, to_imu_axes
+from rovgraph.simulate.environment import EARTH_FIELD_T, Iron, compass_turn
 from rovgraph.simulate.files import write_log
-from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes
-from rovgraph.simulate.magnetism import EARTH_FIELD_T, Iron, compass_turn
-from rovgraph.simulate.noise import THESIS, remembered
-from rovgraph.state import State
-from rovgraph.thesis import R_DVL, R_MTI, WAVE_HZ
+from rovgraph.simulate.truth import THESIS, remembered
 
 CONFIG = falcon()
 ACC, GYR = ["acc_x", "acc_y", "acc_z"], ["gyr_x", "gyr_y", "gyr_z"]

@@ -12,12 +12,22 @@ import pytest
 from autopilot_files import DataFlashWriter, autopilot_messages, dataflash_of, packed, short_dive, tlog
 
 import rovgraph as rg
-from rovgraph import spilling
 from rovgraph.errors import InputError
-from rovgraph.interchange import read_recording
-from rovgraph.interchange.recording import Channel
-from rovgraph.interchange.stamps import put_in_order
-from rovgraph.spilling import Column, FlatTable, computed, every, holds, median_step, spilled, steps, taken
+from rovgraph.log import disk_columns
+from rovgraph.log.disk_columns import (
+    FlatTable,
+    GrowingColumn,
+    computed,
+    every,
+    holds,
+    median_step,
+    spilled,
+    steps,
+    taken,
+)
+from rovgraph.readers import read_recording
+from rovgraph.readers.recording import Channel
+from rovgraph.readers.stamps import put_in_order
 
 CONVERT = """
 import resource, sys, tempfile
@@ -32,9 +42,9 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="what a process holds
 @pytest.fixture
 def short(monkeypatch):
     """Every column is a long one."""
-    monkeypatch.setattr(spilling, "PIECE", 7)
-    monkeypatch.setattr(spilling, "IN_MEMORY", 0)
-    monkeypatch.setattr(spilling, "NEW", 30)
+    monkeypatch.setattr(disk_columns, "PIECE", 7)
+    monkeypatch.setattr(disk_columns, "IN_MEMORY", 0)
+    monkeypatch.setattr(disk_columns, "NEW", 30)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +107,7 @@ def test_a_median_in_pieces_is_that_of_numpy_to_the_last_bit(short, count, digit
 
 
 def test_a_column_and_a_table_hold_what_they_were_given(short):
-    column, table = Column("i4"), FlatTable(2)
+    column, table = GrowingColumn("i4"), FlatTable(2)
     for k in range(50):
         column.extend(np.arange(k))
         table.append((k, -k))
@@ -130,8 +140,8 @@ def test_stamps_that_are_nearly_in_order_are_sorted_as_any(short):
 
 
 def test_what_reading_allocates_does_not_grow_with_the_rows(monkeypatch, tmp_path):
-    monkeypatch.setattr(spilling, "PIECE", 1 << 12)
-    monkeypatch.setattr(spilling, "IN_MEMORY", 1 << 15)
+    monkeypatch.setattr(disk_columns, "PIECE", 1 << 12)
+    monkeypatch.setattr(disk_columns, "IN_MEMORY", 1 << 15)
     most = []
     for rows in (400_000, 1_200_000):
         path = imu_log(tmp_path / f"{rows}.BIN", rows)
@@ -186,8 +196,8 @@ def test_too_many_open_files_are_not_taken_for_a_full_disk(monkeypatch):
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    monkeypatch.setattr(spilling, "IN_MEMORY", 0)
-    columns = [spilling.Column(float) for _ in range(100)]
+    monkeypatch.setattr(disk_columns, "IN_MEMORY", 0)
+    columns = [disk_columns.GrowingColumn(float) for _ in range(100)]
     resource.setrlimit(resource.RLIMIT_NOFILE, (len([*Path("/proc/self/fd").iterdir()]) + 10, limits[1]))
     try:
         with pytest.raises(InputError, match=r"Too many open files.*ulimit -n"):
@@ -203,7 +213,7 @@ def test_no_temporary_file_stays(short, error, monkeypatch, tmp_path):
     path = imu_log(tmp_path / "dive.BIN", 300_000)
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    monkeypatch.setattr(spilling, "PIECE", 1 << 12)
+    monkeypatch.setattr(disk_columns, "PIECE", 1 << 12)
     seen = []
 
     def interrupt(what: str, done: float) -> None:

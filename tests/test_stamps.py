@@ -15,11 +15,11 @@ from wire import sentence
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import read_recording
-from rovgraph.interchange.merging import merge
-from rovgraph.interchange.recording import Channel, Clock, Recording
-from rovgraph.interchange.stamps import put_in_order
-from rovgraph.stamps import COUNTERS, LEAP_S, ROLLOVER_S, known_offset, mend, unwrapped
+from rovgraph.log.stamps import COUNTERS, LEAP_S, ROLLOVER_S, known_offset, mend, unwrapped
+from rovgraph.readers.formats import read_recording
+from rovgraph.readers.merging import merge
+from rovgraph.readers.recording import Channel, Clock, Recording
+from rovgraph.readers.stamps import put_in_order
 
 DAY, WEEK, HOUR = 86400.0, 604800.0, 3600.0
 UNIX = 1_740_564_858.0  # 2025-02-26 10:14:18 UTC

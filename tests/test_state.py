@@ -6,7 +6,7 @@ import pytest
 from motions import Delta, propagate
 
 from rovgraph.geometry import exp_rotation, log_rotation, rotate, transpose
-from rovgraph.state import BIAS, POSE, VELOCITY, State, stack_states
+from rovgraph.model.state import BIAS, POSE, VELOCITY, State, stack_states
 
 GRAVITY, N, STEP = 9.81, 5, 1e-6
 

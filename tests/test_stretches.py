@@ -7,20 +7,19 @@ from dives import Simulated, altered, batch, falcon, interrupted, position_error
 from numpy.testing import assert_array_equal
 
 import rovgraph as rg
-from rovgraph.config import beliefs
-from rovgraph.engine import chain_optimum, stretches
-from rovgraph.engine.chain import Chain, ChainStep
-from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
-from rovgraph.engine.chain_window import window
-from rovgraph.engine.gauss_newton import minimise
-from rovgraph.engine.measurements import cost_at_gate
-from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array
-from rovgraph.graph.places import smooth_graph
+from rovgraph.inference import chain_optimum, faulty_intervals
+from rovgraph.inference.chain import Chain, ChainStep
+from rovgraph.inference.chain_optimum import ChainOptimum, smooth_chain, window
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.gauss_newton import minimise
+from rovgraph.inference.graph.places import smooth_graph
+from rovgraph.inference.smoother import BatchSmoother
 from rovgraph.log import Log
+from rovgraph.model.config import beliefs
+from rovgraph.model.state import State
+from rovgraph.problem.measurements import cost_at_gate
 from rovgraph.simulate import Choices
-from rovgraph.state import State
 
 BIASED_S = 20.0
 
@@ -82,8 +81,8 @@ def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
 @pytest.mark.slow
 def test_solutions_of_a_dive_with_the_same_gates_share_the_search(case, monkeypatch):
     log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
-    dive, searches, search = batch(log, case.config), [], stretches._without_stretches
-    monkeypatch.setattr(stretches, "_without_stretches", lambda *given: searches.append(1) or search(*given))
+    dive, searches, search = batch(log, case.config), [], faulty_intervals._without_stretches
+    monkeypatch.setattr(faulty_intervals, "_without_stretches", lambda *given: searches.append(1) or search(*given))
     first = dive.optimum()
     again = dive.optimum()
     assert len(searches) == 1
@@ -211,7 +210,7 @@ def test_a_stretch_is_found_in_a_part_of_the_dive_as_in_all_of_it(reach, monkeyp
     (whole,) = optimum(log, case).solution.stretches
     made, make = [], chain_optimum.window
     monkeypatch.setattr(chain_optimum, "window", lambda *given: made.append(make(*given)) or made[-1])
-    monkeypatch.setattr(stretches, "REACH_S", reach)
+    monkeypatch.setattr(faulty_intervals, "REACH_S", reach)
     (part,) = optimum(log, case).solution.stretches
     assert made[0] is not None and (made[0].keyframes.start > 0) == (reach < FROM)
     assert part.sensor == whole.sensor == "dvl"

@@ -15,10 +15,10 @@ from tasks import errand
 import rovgraph as rg
 from rovgraph.cli.app import main
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.studies.engines import Cluster, Local
-from rovgraph.studies.misalignment import RUN_COLUMNS, Cell, Study, Task, chosen, one_run, open_results, read_study
-from rovgraph.studies.misalignment import study as run_study
-from rovgraph.studies.misalignment.cells import cell_table
+from rovgraph.lab.executors import Cluster, Local
+from rovgraph.lab.misalignment import RUN_COLUMNS, Cell, CellTask, Study, chosen, one_run, open_results, read_study
+from rovgraph.lab.misalignment import study as run_study
+from rovgraph.lab.misalignment.results import cell_table
 
 ROOT = Path(__file__).parents[1]
 SHORT = """
@@ -55,7 +55,7 @@ class Here:
 
 def quick_run(task):
     """A row that depends on the task alone, without a dive."""
-    from rovgraph.studies.misalignment.run import Done
+    from rovgraph.lab.misalignment.run import Done
 
     rng = np.random.default_rng(task.seed)
     error, sd = 2.0 * rng.standard_normal(), 2.0
@@ -123,9 +123,9 @@ def test_seeds_depend_on_cell_and_run_alone_and_estimators_share_dives():
 
 def test_a_run_is_reproducible_alone(short):
     plan = read_study(short)
-    rows = [one_run(Task(plan, plan.all_cells()[0], 1)).row for _ in range(2)]
+    rows = [one_run(CellTask(plan, plan.all_cells()[0], 1)).row for _ in range(2)]
     smaller = Study.model_validate({"seed": 3, "cells": [plan.all_cells()[0].model_dump()]})
-    rows.append(one_run(Task(smaller, smaller.all_cells()[0], 1)).row)
+    rows.append(one_run(CellTask(smaller, smaller.all_cells()[0], 1)).row)
     without_time = [{k: v for k, v in row.items() if k != "cpu_s"} for row in rows]
     assert without_time[0] == without_time[1] == without_time[2]
     assert set(rows[0]) <= set(RUN_COLUMNS)
@@ -135,7 +135,7 @@ def test_a_run_is_reproducible_alone(short):
 def test_a_run_has_what_was_asked_for_beside(short):
     plan = read_study(short).model_copy(update={"history": True, "held_track": True})
     cell = Cell(manoeuvre="circle", duration_s=36.0, misalignment_deg=45.0, fix_sd_m=0.5, prior_sd_deg=10.0)
-    done = one_run(Task(plan, cell, 0))
+    done = one_run(CellTask(plan, cell, 0))
     assert done.row["track_rms_held_m"] > 0.0
     assert [h["time_s"] for h in done.history][-1] == 36.0
     assert abs(done.row["estimate_deg"] - 45.0) == pytest.approx(abs(done.row["error_deg"]))
@@ -144,13 +144,13 @@ def test_a_run_has_what_was_asked_for_beside(short):
 
 def test_a_dive_can_be_logged_without_its_start_and_its_stop(short):
     whole, cut = (Cell(manoeuvre="straight", duration_s=60, waves=False, cut_s=s) for s in (0, 20))
-    sd = [one_run(Task(read_study(short), cell, 0)).row["sd_deg"] for cell in (whole, cut)]
+    sd = [one_run(CellTask(read_study(short), cell, 0)).row["sd_deg"] for cell in (whole, cut)]
     assert sd[0] < 0.8 * sd[1]  # start and stop are what a straight dive shows
 
 
 def test_an_estimator_that_fails_is_a_row_that_says_why(short, monkeypatch):
-    monkeypatch.setattr("rovgraph.studies.misalignment.run._of", lambda outcome: 1 / 0)
-    row = one_run(Task(read_study(short), Cell(manoeuvre="circle", duration_s=36.0), 0)).row
+    monkeypatch.setattr("rovgraph.lab.misalignment.run._of", lambda outcome: 1 / 0)
+    row = one_run(CellTask(read_study(short), Cell(manoeuvre="circle", duration_s=36.0), 0)).row
     assert row["failure"] == "ZeroDivisionError: division by zero"
 
 
@@ -160,7 +160,7 @@ def finished_study(folder, plan, engine, resume=False):
 
 @pytest.fixture
 def without_dives(monkeypatch):
-    monkeypatch.setattr("rovgraph.studies.misalignment.results.one_run", quick_run)
+    monkeypatch.setattr("rovgraph.lab.misalignment.results.one_run", quick_run)
 
 
 def test_resuming_after_an_interruption_gives_the_same_tables(short, tmp_path, without_dives):
@@ -265,7 +265,7 @@ def test_a_worker_killed_in_the_middle_leaves_a_complete_result(short, tmp_path)
         tables = run_study(plan, open_results(tmp_path / "out", plan, False), engine=Local(1), progress=kill_one)
     assert killed
     assert tables.runs["failure"].isna().all()
-    expected = [one_run(Task(plan, cell, 0)).row["error_deg"] for cell in plan.all_cells()]
+    expected = [one_run(CellTask(plan, cell, 0)).row["error_deg"] for cell in plan.all_cells()]
     assert tables.runs["error_deg"].tolist() == expected
 
 
@@ -299,7 +299,7 @@ def run(monkeypatch, capsys):
 def test_the_command_writes_everything_and_shows_coverage_of_each_cell(
     run, short, tmp_path, monkeypatch, without_dives
 ):
-    monkeypatch.setattr("rovgraph.studies.engines.Local", lambda jobs: Here())
+    monkeypatch.setattr("rovgraph.lab.executors.Local", lambda jobs: Here())
     out = tmp_path / "out"
     code, shown, errors = run("--config", short, "--out", out)
     assert (code, errors) == (0, "")
@@ -316,7 +316,7 @@ def test_the_command_writes_everything_and_shows_coverage_of_each_cell(
 
 
 def test_the_library_writes_what_the_command_writes(run, short, tmp_path, monkeypatch, without_dives):
-    monkeypatch.setattr("rovgraph.studies.engines.Local", lambda jobs: Here())
+    monkeypatch.setattr("rovgraph.lab.executors.Local", lambda jobs: Here())
     assert run("--config", short, "--out", tmp_path / "command")[0] == 0
     tables = rg.study_misalignment(short, tmp_path / "twin")
     same_files(tmp_path / "command", tmp_path / "twin")
@@ -326,7 +326,7 @@ def test_the_library_writes_what_the_command_writes(run, short, tmp_path, monkey
 
 
 def test_an_interrupt_says_how_to_go_on(run, short, tmp_path, monkeypatch, without_dives):
-    monkeypatch.setattr("rovgraph.studies.engines.Local", lambda jobs: Here(most=1))
+    monkeypatch.setattr("rovgraph.lab.executors.Local", lambda jobs: Here(most=1))
     code, shown, _ = run("--config", short, "--out", tmp_path / "out")
     assert code == 130
     assert "--resume" in shown
@@ -340,7 +340,7 @@ def test_the_cells_are_listed_without_a_run(run, short):
 
 def test_a_scheduler_that_is_not_there_is_one_line(run, short, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("rovgraph.studies.engines.CONNECT_S", 0.3)
+    monkeypatch.setattr("rovgraph.lab.executors.CONNECT_S", 0.3)
     code, _, errors = run("--config", short, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
     assert code == 2
     assert errors.startswith("error: tcp://127.0.0.1:9: no Dask scheduler answers there")

@@ -14,12 +14,12 @@ from wire import Heard, decoded
 
 import rovgraph as rg
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.export import Track
-from rovgraph.export import tag as tag_table
 from rovgraph.geometry import matrix_from_rpy
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.log.units import turn_angles
-from rovgraph.trajectory import Trajectory
+from rovgraph.report.export import Track
+from rovgraph.report.export import tag as tag_table
 
 T0 = 1777627800.0  # 2026-05-01 09:30:00 UTC
 N = 40

@@ -26,33 +26,31 @@ from dives import (
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 
-from rovgraph import thesis
-from rovgraph.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.errors import InputError
-from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate
-from rovgraph.estimators.thesis import FILTERS, Filter, FilterJob, run_filter, run_filters
-from rovgraph.estimators.thesis import quaternion as quat
-from rovgraph.estimators.thesis.dvl import DvlModel, Ping
-from rovgraph.estimators.thesis.known import KnownMotion
-from rovgraph.estimators.thesis.mti import Accelerometer, Mti, reference_field
-from rovgraph.estimators.thesis.processes import (
+from rovgraph.geometry import Array, matrix_from_rpy, skew, transpose, wrap_angle
+from rovgraph.inference.estimate import RESIDUAL_COLUMNS, Estimate
+from rovgraph.inference.trajectory import read_trajectory
+from rovgraph.lab.thesis import FILTERS, Filter, FilterJob, run_filter, run_filters
+from rovgraph.lab.thesis import core as quat
+from rovgraph.lab.thesis.measurements import Accelerometer, DvlModel, Mti, Ping, reference_field
+from rovgraph.lab.thesis.processes import (
     ConstantAcceleration,
     HydrodynamicModel,
     KnownAttitude,
+    KnownMotion,
     Process,
     length,
 )
-from rovgraph.estimators.thesis.recursion import Recursion
-from rovgraph.estimators.thesis.setup import Setup, prepare
-from rovgraph.estimators.thesis.timetable import timetable
-from rovgraph.geometry import Array, matrix_from_rpy, skew, transpose, wrap_angle
-from rovgraph.instruments import hydrodynamics, instruments
+from rovgraph.lab.thesis.recursion import Recursion, timetable
+from rovgraph.lab.thesis.setup import Setup, prepare
 from rovgraph.log import Log, Stream, read_log
+from rovgraph.model import thesis
+from rovgraph.model.config import Config, beliefs, load_config, mount_matrix
+from rovgraph.model.state import POSE, State
 from rovgraph.sensors import MagneticField
+from rovgraph.sensors.instruments import hydrodynamics, instruments
 from rovgraph.simulate import CALM, Motion, Style
-from rovgraph.simulate.imu import specific_force_and_rate
-from rovgraph.state import POSE, State
-from rovgraph.trajectory import read_trajectory
+from rovgraph.simulate.dive import specific_force_and_rate
 
 FULL = [name for name, f in FILTERS.items() if not f.attitude_given]
 WITHOUT_THRUSTERS = [name for name in FILTERS if name != "4.2"]
@@ -95,7 +93,7 @@ def test_quaternion_and_its_rate_are_those_of_a_rotation():
 @pytest.mark.parametrize("inverse", [False, True])
 def test_slope_of_a_turn_is_its_derivative(inverse):
     left = matrix_from_rpy([0.3, -0.8, 2.0])
-    turn, q = quat.Turn(inverse, left), np.array([0.4, -0.3, 0.7, 0.6])
+    turn, q = quat.ConstantTurn(inverse, left), np.array([0.4, -0.3, 0.7, 0.6])
     assert_allclose(turn(q)[1].reshape(9, 4), differences(lambda q: turn(q)[0].ravel(), q), atol=1e-9)
     R = quat.matrix(quat.unit(q))
     assert_allclose(turn(quat.unit(q))[0], left @ (R.T if inverse else R), atol=1e-14)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
-from rovgraph.live.track import TrackFile
-from rovgraph.trajectory import Trajectory, read_trajectory
+from rovgraph.inference.trajectory import Trajectory, read_trajectory
+from rovgraph.live.files import TrackFile
 
 N = 40
 

@@ -7,17 +7,17 @@ import pytest
 from dives import Simulated, batch, changed, fed, kept, renewed, simulated
 from live import flown
 
-from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.dive import smooth
-from rovgraph.estimators import results
-from rovgraph.estimators.eskf.fixed_lag import FixedLag
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.results import second_order
-from rovgraph.estimators.smoother import smoothed
+from rovgraph.inference import estimate
+from rovgraph.inference.estimate import second_order
+from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import smoothed
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
+from rovgraph.model.config import Config, beliefs, parse_config
 from rovgraph.simulate import Truth
 from rovgraph.simulate.files import known
-from rovgraph.trajectory import Trajectory
 
 DEG = np.deg2rad(1.0)
 ALONE = parse_config("heading: {sources: [ahrs]}\nimu: {lever_arm_m: [0.1, 0, 0]}\nenvironment: {dip_deg: 72}")
@@ -148,7 +148,7 @@ def both(log: Log, config: Config, monkeypatch) -> list[tuple[Trajectory, Trajec
 
     whole = tracks()
     with monkeypatch.context() as patch:
-        patch.setattr(results, "rests_on_doubtful_compass", lambda initial: False)
+        patch.setattr(estimate, "rests_on_doubtful_compass", lambda initial: False)
         return list(zip(whole, tracks(), strict=True))
 
 

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from dives import altered, batch, changed, falcon, simulated, true_at
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import beliefs, parse_config
 from rovgraph.diagnosis import find_alarms
 from rovgraph.diagnosis.unstated_noise import find_errors, find_noise, noise_factor, unstated
 from rovgraph.dive import smooth
-from rovgraph.engine.chain import Chain
-from rovgraph.engine.lasting import LASTING, _Baseline, find_lasting, unity
-from rovgraph.engine.linear_constants import LinearConstants
-from rovgraph.gauss_markov import stationary_walk
+from rovgraph.inference.chain import Chain
+from rovgraph.inference.correlated_noise import LASTING, LinearConstants, _Baseline, find_correlated_noise, unity
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import beliefs, parse_config
+from rovgraph.model.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
 
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
@@ -136,7 +135,7 @@ def test_search_costs_three_eliminations_of_a_healthy_dive_and_few_of_others(cor
         best = batch(case.log, config).optimum()
         best.covariances()
         calls.clear()
-        assert len(find_lasting(best)[0]) == errors
+        assert len(find_correlated_noise(best)[0]) == errors
         assert 0 < len(calls) <= most
 
 
@@ -149,7 +148,7 @@ def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_w
     known = best.beliefs["dvl_error"]
     with_error = best.unknowns.with_lasting(replace(known, estimate=True, walk=stationary_walk(1e-5, 30.0)))
     assert {*best.unknowns.estimated} < {*with_error.estimated} and with_error.considered == best.unknowns.considered
-    assert find_lasting(best) == ([], [])
+    assert find_correlated_noise(best) == ([], [])
     root = best.chain.eliminate(best.linearised_at, best.solution.gates)
     assert best.linear == pytest.approx((root.log_determinant(), root.left), rel=1e-9)
 

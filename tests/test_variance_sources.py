@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 
 import rovgraph as rg
-from rovgraph.engine.released import release
-from rovgraph.engine.variance_sources import variance_sources
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble
-from rovgraph.pages.causes import CAUSES, largest_cause
-from rovgraph.pages.reporting import page_of
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.score_test import score_test
+from rovgraph.inference.smoother import assemble
+from rovgraph.inference.variance_sources import variance_sources
+from rovgraph.model.state import POSE
+from rovgraph.report.pages.reporting import page_of
+from rovgraph.report.pages.verdict import CAUSES, largest_cause
 from rovgraph.sensors import SENSORS
-from rovgraph.state import POSE
 
 
 def simulated(**choices):
@@ -42,9 +42,9 @@ def test_a_dive_in_pieces_is_a_whole_dive(monkeypatch):
     dive = simulated()
     best = assemble(dive.log, initialise(dive.log, dive.config)).optimum(None)
     released = "gyr_scale", "dvl_time_offset", "mag_time_offset"
-    whole = variance_sources(best, 100), release(best, released)
-    monkeypatch.setattr("rovgraph.engine.pieces.LENGTH", 64)
-    assert (variance_sources(best, 100), release(best, released)) == whole
+    whole = variance_sources(best, 100), score_test(best, released)
+    monkeypatch.setattr("rovgraph.problem.measurements.LENGTH", 64)
+    assert (variance_sources(best, 100), score_test(best, released)) == whole
 
 
 def test_a_start_known_to_ten_metres_limits_a_dive_without_fixes(tmp_path):

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from recordings import check_dive_comes_back, check_refused_or_whole, close, first, read
 
 import rovgraph as rg
+from rovgraph.dates import unix_of_gps
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix
-from rovgraph.gps_time import unix_of_gps
-from rovgraph.interchange.formats import recognise
+from rovgraph.readers.formats import recognise
 from rovgraph.simulate import Choices
 
 ACC, GYR, MAG = (0.1, -0.2, -9.8), (0.01, 0.02, 0.03), (0.2, 0.05, 0.4)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rovgraph.config import Config, parse_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, rotate, transpose
-from rovgraph.instruments import hydrodynamics
-from rovgraph.thesis import FLIP
-from rovgraph.vehicle import Hydrodynamics
+from rovgraph.model.config import Config, parse_config
+from rovgraph.model.hydrodynamics import Hydrodynamics
+from rovgraph.model.thesis import FLIP
+from rovgraph.sensors.instruments import hydrodynamics
 
 FALCON = hydrodynamics(Config())
 RNG = np.random.default_rng(0)

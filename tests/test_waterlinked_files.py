@@ -11,10 +11,10 @@ from recordings import check_refused_or_whole, close, first, read
 from wire import report
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import recognise
-from rovgraph.interchange.recording import Recording
-from rovgraph.interchange.waterlinked_reports import velocity_report
 from rovgraph.log import Log
+from rovgraph.readers.formats import recognise
+from rovgraph.readers.recording import Recording
+from rovgraph.readers.waterlinked import velocity_report
 
 START = 1_638_191_471.0
 

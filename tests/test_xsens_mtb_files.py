@@ -11,7 +11,7 @@ from recordings import check_dive_comes_back, check_refused_or_whole, close, fir
 import rovgraph as rg
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
-from rovgraph.interchange.formats import recognise
+from rovgraph.readers.formats import recognise
 
 ACC, GYR, MAG = (0.1, 0.2, 9.8), (0.01, 0.02, 0.03), (0.5, 0.1, -0.8)
 FLU = np.diag([1.0, -1.0, -1.0])

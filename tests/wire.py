@@ -6,10 +6,10 @@ from collections import Counter
 import pynmea2
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from rovgraph.config import Config
 from rovgraph.live.message import Message
-from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
+from rovgraph.live.sources.mavlink import MavlinkDecoder, MavlinkOptions
 from rovgraph.live.sources.source import Chunk, Decoder
+from rovgraph.model.config import Config
 
 ARRIVAL = 1_700_000_000.0
 
@@ -82,7 +82,7 @@ def vision(confidence: float = 90.0, dt: int = 100_000, usec: int = 9_000_000) -
 
 
 def autopilot(heard: Heard, config: Config | None = None, **options: object) -> MavlinkDecoder:
-    return MavlinkDecoder("m", heard, config or Config(), Options(**options))
+    return MavlinkDecoder("m", heard, config or Config(), MavlinkOptions(**options))
 
 
 def sentence(body: str) -> bytes:

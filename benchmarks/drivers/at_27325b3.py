@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 from driver import processor, run
+from rovgraph.config import Config, load_config
 from rovgraph.estimators.dive import assemble, smooth
 from rovgraph.estimators.error_state import RENEW_AT_S, replay
+from rovgraph.estimators.initialise import initialise
 from rovgraph.live.complaints import Complaints
 
-from rovgraph.config import Config, load_config
-from rovgraph.estimators.initialise import initialise
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator

@@ -11,14 +11,14 @@ from driver import processor, run
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from online import falcon, replay
 
-from rovgraph.config import Config, load_config
 from rovgraph.dive import smooth
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
-from rovgraph.estimators.eskf.error_state import replay as replay_filter
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import assemble
+from rovgraph.inference.error_state import REINITIALISE_AT_S
+from rovgraph.inference.error_state import replay as replay_filter
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import assemble
 from rovgraph.log import Log, read_log
-from rovgraph.process import be_frugal
+from rovgraph.model.config import Config, load_config
+from rovgraph.process import limit_threads_and_gc
 from rovgraph.simulate import Choices, choices, simulated
 from rovgraph.simulate.files import write_log
 
@@ -50,7 +50,7 @@ def isam2(*files: str) -> float:
     """Processor time of both estimates, the smoothed one by iSAM2 [s]."""
     log, config = read(*files)
     config = config.model_copy(update={"graph": config.graph.model_copy(update={"solver": "isam2"})})
-    import_module("rovgraph.estimators.incremental")  # and GTSAM, which 27325b3 imports with all else
+    import_module("rovgraph.inference.graph.isam2")  # and GTSAM, which 27325b3 imports with all else
     began = processor()
     smooth(log, config, "both")
     return processor() - began
@@ -85,6 +85,6 @@ def chain(keyframes: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    be_frugal()  # as the command does
+    limit_threads_and_gc()  # as the command does
     measures = {"filter": filtered, "smoother": smoothed, "isam2": isam2, "online": online}
     run({**measures, "simulate": simulate, "chain": chain})

@@ -15,7 +15,7 @@ from fault_campaign.instruments import sample
 from fault_campaign.judge import COMMANDS, Dive, Outcome, Result, Tally, judge, run_dive
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
-from rovgraph.workers import starting, workers
+from rovgraph.lab.executors import starting, workers
 
 Task = tuple[str, int, bool]  # name of the case, seed, online too
 

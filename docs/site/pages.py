@@ -34,8 +34,8 @@ ELSEWHERE = {  # page or file of the site -> file of the project
 }
 FOLDERS = {"examples": "examples.md"}  # folder of the project -> page that shows it
 RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
-    "rovgraph.estimators.estimate.Estimate",
-    "rovgraph.estimators.estimate.CalibrationEstimate",
+    "rovgraph.inference.estimate.Estimate",
+    "rovgraph.inference.estimate.CalibrationEstimate",
     "rovgraph.diagnosis.Alarm",
     "rovgraph.api.online.LiveRun",
     "rovgraph.live.solution.Solution",

@@ -1,4 +1,7 @@
-"""Native files as one log: what ``rovgraph convert`` does, and `read_log` of anything but a single log."""
+"""Native files as one log: what ``rovgraph convert`` does, and `read_log` of anything but a single log.
+
+A mapping of the columns of anyone's table: what ``rovgraph convert --guess`` proposes.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,22 +11,40 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from rovgraph.config import AS_WRITTEN, Config, FileSettings, completed, config_or_defaults
-from rovgraph.config.reading import fits
 from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
-from rovgraph.interchange.account import account, notes
-from rovgraph.interchange.alternatives import SourceMissing
-from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
-from rovgraph.interchange.merging import ARRIVAL, EVERY, Merged, merge
-from rovgraph.interchange.own_log import FORMAT as OWN_LOG
-from rovgraph.interchange.own_log import is_own_log
-from rovgraph.interchange.recording import Recording, earlier
-from rovgraph.interchange.unknown import is_text, purpose, refusal
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, usable_beams
-from rovgraph.log.units import nearest
-from rovgraph.progress import Progress, no_progress
-from rovgraph.tables import names_of, table_beside
+from rovgraph.log.tables import names_of, read_table, table_beside
+from rovgraph.log.units import groups, nearest, quantities
+from rovgraph.model.config import (
+    AS_WRITTEN,
+    Config,
+    FileSettings,
+    TableSettings,
+    completed,
+    config_or_defaults,
+    fits,
+    parse_config,
+)
+from rovgraph.process import Progress, no_progress
+from rovgraph.readers.formats import (
+    Format,
+    ReadingOptions,
+    formats,
+    head_of,
+    is_text,
+    purpose,
+    read_recording,
+    recognise,
+    refusal,
+)
+from rovgraph.readers.guessing import guess_table
+from rovgraph.readers.guessing.groups import ColumnGuess
+from rovgraph.readers.guessing.quantities import POINTS_UP
+from rovgraph.readers.merging import ARRIVAL, EVERY, Merged, account, merge, notes
+from rovgraph.readers.own_log import FORMAT as OWN_LOG
+from rovgraph.readers.own_log import is_own_log
+from rovgraph.readers.recording import Recording, SourceMissing, earlier
 
 Paths = Path | str | Sequence[Path | str]
 NOTHING: Mapping[str, Any] = {}
@@ -183,7 +204,7 @@ def convert(
             progress(f"reading {name}", (k + done / max(total, 1)) / len(files))
 
         settings = settings_of[k]
-        options = Options(inside, read, settings, bool(times))
+        options = ReadingOptions(inside, read, settings, bool(times))
         recording = _read(path, options, format_, len(files) == 1)
         recordings.append(earlier(recording, settings.delay_s) if settings.delay_s else recording)
     progress("joining clocks", 1.0)
@@ -260,7 +281,7 @@ def _times(given: str | Mapping[str, str]) -> Mapping[str, str]:
     return times
 
 
-def _read(path: Path, options: Options, format_: Format | None, alone: bool) -> Recording:
+def _read(path: Path, options: ReadingOptions, format_: Format | None, alone: bool) -> Recording:
     """A file; where it is one of several, another one may have what was chosen, or else `merge` refuses it."""
     try:
         return read_recording(path, options, format_)
@@ -297,3 +318,154 @@ def is_plain_log(path: Path, config: Config) -> bool:
 def _format(path: Path, config: Config) -> Format | None:
     """The format of a file, by its content; None = by the formats' own word."""
     return OWN_LOG if is_plain_log(path, config) else None
+
+
+REASONS = {
+    "imu": POINTS_UP,
+    "dvl": "its axes point forward, to port and up by their names",
+    "angles": "counts anticlockwise by the gyro, and its name says ENU",
+    "times": "day and month may be exchanged: both orders are possible",
+}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A mapping of the columns of a table, to be confirmed.
+
+    Attributes
+    ----------
+    source : the file
+    columns : what each column may be, in the order of the file; of these, the unsure ones are not proposed
+    left : column -> why it feeds nothing
+    settings : of a configuration, that names or numbers show: mountings, how headings count, the order of dates
+    notes : a sentence each
+    """
+
+    source: str
+    columns: tuple[ColumnGuess, ...]
+    left: Mapping[str, str]
+    settings: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def proposed(self) -> tuple[ColumnGuess, ...]:
+        """The columns that are sure or likely."""
+        return tuple(each for each in self.columns if each.sureness != "unsure")
+
+    @property
+    def mapping(self) -> dict[str, str]:
+        """Column of a log -> the file's column, as a configuration's ``columns`` has it, but for equal names."""
+        return {each.field: each.column for each in self.proposed if each.field != each.column}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Group or column -> unit, as a configuration's ``units`` has it."""
+        kinds = quantities()
+        known = {each.field: each.unit for each in self.proposed if each.unit and each.field in kinds}
+        out: dict[str, str] = {}
+        for group, members in groups().items():
+            units = {field: known[field] for field in members if field in known}
+            same = len(set(units.values())) == 1 and len({kinds[field] for field in units}) == 1
+            out |= {group: next(iter(units.values()))} if same else units
+        return out
+
+    @property
+    def config(self) -> Config:
+        """The configuration that is proposed."""
+        return parse_config(self.to_yaml(), f"guess of {self.source}")
+
+    def to_yaml(self) -> str:
+        """``columns`` and ``units`` for a configuration, and settings; unsure columns are comments."""
+        return proposal([self])
+
+    def save(self, path: Path | str, force: bool = False) -> Path:
+        """Write the configuration.
+
+        Raises
+        ------
+        InputError : the file exists and ``force`` is not given, or cannot be written
+        """
+        return save_proposal([self], path, force)
+
+
+def proposal(guesses: Sequence[Guess]) -> str:
+    """The configuration that one table's guess, or those of several, propose, as YAML; several stand under ``files``.
+
+    Mountings hold for all tables; those of the first one take precedence.
+    """
+    from rovgraph.report.conversion import commented_yaml
+
+    sections: dict[str, Any] = {}
+    reasons: dict[str, str] = {}
+    for guess in guesses:
+        own: dict[str, Any] = {"columns": guess.mapping, "units": guess.units}
+        above = f"files.{Path(guess.source).name}." if len(guesses) > 1 else ""
+        reasons |= {f"{above}columns.{each.field}": f"{each.sureness}: {each.why}" for each in guess.proposed}
+        for section, keys in guess.settings.items():
+            of_table = section in TableSettings.model_fields
+            (own if of_table else sections).setdefault(section, {}).update(keys)
+            reasons |= {f"{above if of_table else ''}{section}.{key}": REASONS[section] for key in keys}
+        stated = {name: section for name, section in own.items() if section}
+        if len(guesses) > 1:
+            sections.setdefault("files", {})[Path(guess.source).name] = stated
+        else:
+            sections = stated | sections
+    text = commented_yaml(sections, reasons) if sections else ""
+    unsure = [each for guess in guesses for each in guess.columns if each.sureness == "unsure"]
+    lines = [f"# unsure: {each.field}: {_one_line(each.column)}  ({each.why})" for each in unsure]
+    return text + "".join(f"{line}\n" for line in lines)
+
+
+def save_proposal(guesses: Sequence[Guess], path: Path | str, force: bool = False) -> Path:
+    """Write the configuration that `proposal` gives.
+
+    Raises
+    ------
+    InputError : the file exists and ``force`` is not given, or cannot be written
+    """
+    from rovgraph.report.folder import results_files
+
+    path = as_path(path, "path")
+    if any(path.resolve() == Path(guess.source).resolve() for guess in guesses):
+        raise InputError(f"{path} is the file that is read; choose another name")
+    names = ", ".join(_one_line(Path(guess.source).name) for guess in guesses)
+    with results_files([path], force) as (temporary,):
+        temporary.write_text(f"# Proposed for {names}: confirm each line\n" + proposal(guesses), encoding="utf-8")
+    return path
+
+
+def guess_columns(path: Path | str) -> Guess:
+    """Propose how the columns of anyone's table map to those of a log, by names, ranges and physics.
+
+    Parameters
+    ----------
+    path : CSV, gzipped CSV or Parquet
+
+    Returns
+    -------
+    Guess : ``.columns`` with reasons, ``.to_yaml()`` for a configuration; confirm it, and check the log with it
+
+    Raises
+    ------
+    InputError : no table, no names of columns, no time, or a native file, which needs no mapping
+
+    Warns
+    -----
+    DataWarning : how the table was read, where it is not written as a log of this program
+    """
+    path = as_path(path, "path")
+    head = head_of(path)
+    format_ = recognise(path)
+    if format_ is not None and format_ is not OWN_LOG:
+        raise InputError(f"{path}: is a {format_.title}, whose columns are known; convert it without a guess")
+    if what := purpose(path, head):
+        raise InputError(f"{path}: {what}")
+    table = read_table(path)
+    found = guess_table(table)
+    table.warn_how()
+    return Guess(str(path), tuple(found.columns), found.left, found.settings, tuple(found.notes))
+
+
+def _one_line(text: str) -> str:
+    """A text as it may stand in a comment."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))

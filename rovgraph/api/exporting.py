@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rovgraph.errors import InputError, as_path, as_texts, kind_of
-from rovgraph.export import Options, Tagged, Track, read_track, write_track
-from rovgraph.export import tag as tag_table
-from rovgraph.export.tagging import column_of, geotag
-from rovgraph.tables import read_cells
+from rovgraph.log.tables import read_cells
+from rovgraph.report.export import Options, Tagged, Track, read_track, write_track
+from rovgraph.report.export import tag as tag_table
+from rovgraph.report.export.tagging import column_of, geotag
 
 if TYPE_CHECKING:
     from rovgraph.api.smoothing import Result

@@ -8,13 +8,13 @@ import pandas as pd
 
 from rovgraph import log as library
 from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log, once
-from rovgraph.check import Finding, Report, bridge_jumps, examine
-from rovgraph.check import warn as warn_of_findings
-from rovgraph.config import Config, completed, config_or_defaults
+from rovgraph.diagnosis.check import Finding, Report, bridge_jumps, examine
+from rovgraph.diagnosis.check import warn as warn_of_findings
 from rovgraph.errors import InputError, as_paths, kind_of, warn
-from rovgraph.estimators.initialise import refusal
+from rovgraph.inference.initialise import refusal
 from rovgraph.log import Log
-from rovgraph.progress import Progress, no_progress
+from rovgraph.model.config import Config, completed, config_or_defaults
+from rovgraph.process import Progress, no_progress
 
 
 def read_log(
@@ -82,7 +82,7 @@ def check(log: Log, config: Config | None = None) -> Report:
     ------
     InputError : the log was read with other columns
     """
-    config = given(log, config)
+    config = config_of(log, config)
     report = examine(log, config)
     if not report.at("error") and refusal(log, config):
         with warnings.catch_warnings():
@@ -104,12 +104,12 @@ def prepared(log: Log, config: Config) -> tuple[Log, Sequence[Finding]]:
     -----
     DataWarning : findings of the check
     """
-    config = given(log, config)
+    config = config_of(log, config)
     log, examined = bridge_jumps(log, config)
     return log, warn_of_findings(log, config, examined).findings
 
 
-def given(log: Log, config: Config | None) -> Config:
+def config_of(log: Log, config: Config | None) -> Config:
     """The configuration that belongs to a log, all defaults where none is given, completed by what its files know.
 
     Raises

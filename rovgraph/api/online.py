@@ -1,32 +1,158 @@
-"""An estimate while data arrive: what ``rovgraph online`` does."""
+"""An estimate while data arrive: what ``rovgraph online`` does.
 
+The folder of a live run, before it and after.
+
+The live page: what ``rovgraph online --http`` opens.
+"""
+
+import contextlib
+import json
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rovgraph.api.live_folder import prepare, settings_of, summarise
-from rovgraph.api.live_page import live_page
-from rovgraph.api.logs import given, warn_of_unused
-from rovgraph.config import Config, Mag, config_or_defaults, with_priors_stated
+from rovgraph.api.logs import config_of, warn_of_unused
 from rovgraph.errors import InputError, as_path, as_texts
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.feed import Feed
-from rovgraph.live.files import Files, Known
-from rovgraph.live.marks import Marks
+from rovgraph.live.files import SETTINGS, Files, KnownSources
+from rovgraph.live.marks import Command, Marks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs import Output, open_output
-from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ, Session
+from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ, Feed, Session
 from rovgraph.live.solution import Solution
 from rovgraph.live.sources import open_sources
 from rovgraph.live.sources.replay import LogReplay
 from rovgraph.live.warnings import Complain, Warnings
 from rovgraph.log import Log
+from rovgraph.model.config import Config, Mag, config_or_defaults, load_config, with_priors_stated
+from rovgraph.report.folder import STAMP, SUMMARY, check_writable
+from rovgraph.report.results import to_plain
 
 if TYPE_CHECKING:
     from rovgraph.web.page import LivePage
+
+
+def settings_of(folder: Path) -> Config:
+    """The configuration of an earlier run; all defaults where it left none."""
+    return load_config(folder / SETTINGS if (folder / SETTINGS).is_file() else None)
+
+
+def prepare(folder: Path, force: bool, sources: Sequence[str]) -> None:
+    """Make the folder of a run.
+
+    Raises
+    ------
+    InputError : it holds something that must not be replaced, or cannot be made
+    """
+    for url in sources:
+        if _file(url).is_relative_to(folder.resolve()):
+            raise InputError(f"{url}: lies in {folder}, which would be replaced; choose another --out")
+    check_writable(folder, force)
+    try:
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another --out") from None
+    _write_summary(folder, {"state": "running"})
+
+
+def summarise(folder: Path, session: Session) -> None:
+    """Write what came of a run.
+
+    Raises
+    ------
+    InputError : it cannot be written
+    """
+    solution, navigator = session.solution, session.navigator
+    if solution is None:
+        with contextlib.suppress(InputError):  # that there is no estimate is the worse news
+            _write_summary(folder, {"state": "no estimate"})
+        return
+    _write_summary(
+        folder,
+        {
+            "state": "finished",
+            "verdict": solution.verdict,
+            "alarms": [vars(alarm) for alarm in navigator.alarms.history.values()],
+            "advice": [vars(advice) for advice in navigator.alarms.advice.values()],
+            "time": solution.time,
+            "position_m": solution.position.tolist(),
+            "position_sd_m": solution.position_sd.tolist(),
+            "distance_m": solution.distance,
+            "calibration": {name: list(pair) for name, pair in solution.calibration.items()},
+            "marks": [asdict(mark) for mark in session.marks.all],
+            "solutions": session.solutions,
+            "left_out": [[*key, count] for key, count in sorted(navigator.left_out.items())],
+            "warnings": [[*key, count] for key, count in sorted(session.warnings.counts.items())],
+            "updates": session.updates(),
+        },
+    )
+
+
+def _file(url: str) -> Path:
+    """The file of a URL, if it is one of a file."""
+    return Path(url.partition(":")[2].partition("?")[0]).resolve()
+
+
+def _write_summary(folder: Path, content: dict[str, Any]) -> None:
+    partial = folder / f".{SUMMARY}.partial"
+    try:
+        plain = to_plain({**STAMP, "kind": "online", **content})
+        partial.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        partial.replace(folder / SUMMARY)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise InputError(f"{folder / SUMMARY}: cannot be written ({error.strerror}); free some space") from None
+
+
+NEEDED = {"starlette", "uvicorn", "websockets", "prometheus_client"}
+
+
+def live_page(
+    address: str = "127.0.0.1:8080",
+    offer: Callable[[Command], bool] | None = None,
+    marks: Marks | None = None,
+    charts: Sequence[Path | str] = (),
+    origins: Sequence[str] = (),
+    token: Path | str | None = None,
+    position_sd_limit_m: float = 5.0,
+    warnings: Warnings | None = None,
+) -> "LivePage":
+    """Serve the live page (docs/live-page.md). Pass each solution to its `send`, and `close` it at the end.
+
+    Parameters
+    ----------
+    address : ``host:port``; a host other than the loopback requires a token, which is in the page's `url`
+    offer : called with commands of pages; None = pages are read-only
+    marks : to show on the map
+    charts : GeoTIFF or GeoJSON files, or folders of tiles, to show under the track
+    origins : of other pages, such as Cockpit's, that may frame the page and read values without a token
+    token : file that holds the token; None = a new token each time
+    position_sd_limit_m : position sd beyond which the page raises an alarm
+    warnings : receives failures of the server
+
+    Raises
+    ------
+    InputError : a missing library, an address that cannot be used, a chart that cannot be read
+    """
+    try:
+        from rovgraph.web.page import LivePage
+        from rovgraph.web.view import PageLimits
+    except ImportError as error:
+        if error.name is None or error.name.partition(".")[0] not in NEEDED:
+            raise
+        raise InputError(f"--http needs {error.name}; install it with: pip install 'rovgraph[web]'") from None
+    if not 0.0 < position_sd_limit_m < float("inf"):
+        raise InputError(f"--position-sd-limit {position_sd_limit_m:g}: expected metres, more than 0")
+    limits = PageLimits(position_sd_m=position_sd_limit_m)
+    return LivePage(address, offer, marks, charts, origins, token, limits, warnings)
+
 
 AS_FAST_AS_POSSIBLE = float("inf")
 ENGINES = ("fixed-lag", "isam2")
@@ -183,7 +309,7 @@ class Online:
             )
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
         warnings = Warnings(on_warning)
-        opened = open_sources(sources, warnings, config, speed, Known(folder, resume, warnings))
+        opened = open_sources(sources, warnings, config, speed, KnownSources(folder, resume, warnings))
         if resume and any(source.pace == 1.0 for source in opened):
             raise InputError("--resume cannot continue a replay at speed 1; add --speed max")
         feed = Feed(opened, warnings)
@@ -225,7 +351,7 @@ class Online:
         ------
         InputError : the log was read with other columns, or allows no estimate
         """
-        config = given(log, self.config)
+        config = config_of(log, self.config)
         if config.imu.mag != Mag():  # its prior is that of a calibrated one, which the log's samples are
             config = with_priors_stated(config, names=("hard_iron",))
         delays = {} if log.config is None else log.config.delay_s

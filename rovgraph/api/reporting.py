@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-from rovgraph.check import Report
+from rovgraph.diagnosis.check import Report
 from rovgraph.errors import InputError, as_path, kind_of
-from rovgraph.pages.about import PAGE
-from rovgraph.pages.campaign import CAMPAIGN, campaign_page
-from rovgraph.pages.page import write
-from rovgraph.pages.reporting import page_of
-from rovgraph.pages.studies import check_page
+from rovgraph.report.pages.page import write
+from rovgraph.report.pages.reporting import page_of
+from rovgraph.report.pages.source import PAGE
+from rovgraph.report.pages.studies import CAMPAIGN, campaign_page, check_page
 
 
 def report(*results: Path | str, out: Path | str | None = None, force: bool = False) -> Path:

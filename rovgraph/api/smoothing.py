@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rovgraph.api.logs import given, prepared
-from rovgraph.config import Config
+from rovgraph.api.logs import config_of, prepared
 from rovgraph.diagnosis import Alarm, Verdict
-from rovgraph.dive import Dive
+from rovgraph.dive import DiveEstimates
 from rovgraph.dive import smooth as smooth_dive
 from rovgraph.errors import InputError, as_path, as_texts, collected_warnings
-from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
-from rovgraph.export import Options, Track, fixes_of, write_track
-from rovgraph.export.track import ESTIMATES as TRACKS
+from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.log import Log
-from rovgraph.progress import Progress, no_progress
+from rovgraph.model.config import Config
+from rovgraph.process import Progress, no_progress
+from rovgraph.report.export import ExportOptions, Track, fixes_of, write_track
+from rovgraph.report.export.track import ESTIMATES as TRACKS
 
 ENGINES = ("batch", "isam2")
 ESTIMATES = ("smoothed", "filtered", "both")
@@ -34,7 +34,7 @@ class Result:
     seconds : stage of the work -> wall time [s]; the command adds that of reading
     """
 
-    dive: Dive
+    dive: DiveEstimates
     log: Log
     warnings: tuple[str, ...]
     seconds: dict[str, float]
@@ -152,7 +152,7 @@ class Result:
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             if export:
-                write_track(self.track(), as_texts(export, "export"), folder, Options())
+                write_track(self.track(), as_texts(export, "export"), folder, ExportOptions())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
             summary = write_results(
                 folder,
@@ -167,7 +167,7 @@ class Result:
             if marks:
                 write_marks(folder / MARKS, marks)
             if page:
-                from rovgraph.pages.reporting import write_page
+                from rovgraph.report.pages.reporting import write_page
 
                 write_page(folder)
             return summary
@@ -233,7 +233,7 @@ def smooth(
     """
     if estimate not in ESTIMATES:
         raise InputError(f"estimate {estimate!r}: expected {', '.join(ESTIMATES)}")
-    config = with_engine(given(log, config), engine)
+    config = with_engine(config_of(log, config), engine)
     began = time.perf_counter()
     with collected_warnings() as texts:
         log, findings = prepared(log, config)

@@ -11,26 +11,15 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from rovgraph import __version__
-from rovgraph.cli.calibrate import calibrate
-from rovgraph.cli.check import check
-from rovgraph.cli.compare import compare
-from rovgraph.cli.config import config
+from rovgraph._version import __version__
 from rovgraph.cli.console import folded
-from rovgraph.cli.convert import convert
-from rovgraph.cli.demo import demo
-from rovgraph.cli.evaluate import evaluate
-from rovgraph.cli.export import export
-from rovgraph.cli.observe import observe
+from rovgraph.cli.lab import calibrate, compare, demo, observe, plan, simulate, study
+from rovgraph.cli.logs import check, config, convert
 from rovgraph.cli.online import online
-from rovgraph.cli.plan import plan
-from rovgraph.cli.report import report
-from rovgraph.cli.simulate import simulate
+from rovgraph.cli.report import evaluate, export, report, tag
 from rovgraph.cli.smooth import smooth
-from rovgraph.cli.study import study
-from rovgraph.cli.tag import tag
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.process import be_frugal
+from rovgraph.process import limit_threads_and_gc
 
 app = typer.Typer(
     name="rovgraph",
@@ -71,7 +60,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object, *
 
 def main() -> None:
     """Entry point of the console script ``rovgraph``."""
-    be_frugal()
+    limit_threads_and_gc()
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = _show_warning
     try:

@@ -1,7 +1,12 @@
-"""Where commands print: the width of tables, and sentences that break between words."""
+"""Where commands print: the width of tables, and sentences that break between words.
+
+A progress bar on long work, on standard error and only where a person looks.
+"""
 
 import os
 import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -52,3 +57,16 @@ def columns(stream: IO[str]) -> int | None:
         return os.get_terminal_size(stream.fileno()).columns or USUAL
     except (OSError, ValueError, AttributeError):
         return None
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """A callback ``(what, done)`` that draws what is being done, ``done`` from 0 to 1."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda what, done: bar.update(task, description=what, completed=done)

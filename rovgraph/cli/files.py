@@ -39,7 +39,7 @@ def read_files(
 ) -> "Log":
     """The log of some files, with a progress bar."""
     import rovgraph as rg
-    from rovgraph.cli.progress import progress_bar
+    from rovgraph.cli.console import progress_bar
 
     with progress_bar() as progress:
         return rg.read_log(files, config, pairs("choose", choose), seconds("shift", shift), progress, whose(times))

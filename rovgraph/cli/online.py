@@ -1,5 +1,11 @@
-"""``rovgraph online``: estimate while data arrive."""
+"""``rovgraph online``: estimate while data arrive.
 
+What ends a command that would go on for ever.
+"""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,8 +15,41 @@ import typer
 if TYPE_CHECKING:
     from rovgraph.live.solution import Solution
 
+SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # Ctrl-C, a system that shuts down, a terminal that is closed
 
-class Engine(StrEnum):
+
+@contextlib.contextmanager
+def ended_by_signals(end: Callable[[], None]) -> Iterator[None]:
+    """Have the first of these signals call ``end``; a second one does what it always does.
+
+    A signal that is ignored, as nohup has it, stays ignored.
+    """
+    handled = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
+    before = {number: handler for number in handled if (handler := signal.getsignal(number)) != signal.SIG_IGN}
+
+    def restore(*_: object) -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def first(*_: object) -> None:
+        restore()
+        end()
+
+    for number in before:
+        signal.signal(number, first)
+    try:
+        yield
+    finally:
+        restore()
+
+
+def asked_by_signal(answer: Callable[[], None]) -> None:
+    """Have SIGUSR1 call ``answer``, where there is such a signal."""
+    if hasattr(signal, "SIGUSR1"):
+        signal.signal(signal.SIGUSR1, lambda *_: answer())
+
+
+class OnlineEngine(StrEnum):
     """What estimates."""
 
     fixed_lag = "fixed-lag"
@@ -29,8 +68,8 @@ def online(
     ] = None,
     speed: Annotated[str, typer.Option(help="speed of replayed files: 1, 10, max")] = "1",
     engine: Annotated[
-        Engine, typer.Option(help="fixed-lag for missions of any length; isam2 also gives the smoothed track")
-    ] = (Engine.fixed_lag),
+        OnlineEngine, typer.Option(help="fixed-lag for missions of any length; isam2 also gives the smoothed track")
+    ] = (OnlineEngine.fixed_lag),
     resume: Annotated[bool, typer.Option("--resume", help="continue after a crash, with the files in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
@@ -53,7 +92,6 @@ def online(
     import sys
 
     import rovgraph as rg
-    from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.report.status import StatusLine
 
     believed = None if config is None else rg.load_config(config)

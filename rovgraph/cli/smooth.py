@@ -15,7 +15,7 @@ NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
 
 
-class Engine(StrEnum):
+class SmoothEngine(StrEnum):
     """What estimates."""
 
     batch = "batch"
@@ -35,7 +35,7 @@ def smooth(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
-        Engine | None,
+        SmoothEngine | None,
         typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; default: graph.solver"),
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
@@ -58,8 +58,8 @@ def smooth(
     import time
 
     import rovgraph as rg
-    from rovgraph.cli.progress import progress_bar
-    from rovgraph.export import check_exportable, known_formats
+    from rovgraph.cli.console import progress_bar
+    from rovgraph.report.export import check_exportable, known_formats
     from rovgraph.report.folder import check_writable
 
     out = Path("results-" + name_of(files)) if out is None else out

@@ -8,9 +8,8 @@ stands above the estimators, whose eliminations it asks for; `rovgraph.dive` and
 
 from collections.abc import Callable, Iterator, Sequence
 
-from rovgraph.diagnosis import constants, motion, residuals, sensors, stretches
+from rovgraph.diagnosis import constants, motion, residuals
 from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, alarm_of, verdict_of
-from rovgraph.diagnosis.dvl_cause import dvl_cause
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.rules import RULES, Rule, Severity
 
@@ -31,29 +30,29 @@ __all__ = [
 TINY = 1e-9  # a limit may be 0
 
 STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
-    dvl_cause,
-    sensors.checked,
-    motion.found,
-    constants.held,
-    constants.moved,
+    motion.dvl_cause,
+    residuals.findings_of_check,
+    motion.found_noise,
+    constants.contradicted_constants,
+    constants.moved_calibration,
     constants.earth_rate,
     motion.bias_drift,
-    sensors.frozen,
-    sensors.no_attitude,
-    stretches.taken_out,
-    stretches.close,
+    residuals.frozen_sensors,
+    residuals.no_attitude,
+    motion.excluded_intervals,
+    motion.ambiguous_optimum,
     residuals.left_out,
     residuals.filter_alone,
     residuals.innovations,
     residuals.rejected,
     residuals.too_large,
     residuals.too_small,
-    residuals.lasting,
-    motion.imu,
+    residuals.correlated_residuals,
+    motion.imu_disagreement,
     motion.rivals,
-    motion.estimates,
+    motion.filter_smoother_separation,
     motion.uncertain,
-    constants.halves,
+    constants.split_half_drift,
 )
 
 
@@ -73,7 +72,7 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
     worst = [alarm for alarm in _worst(numbers) if alarm.severity != "advice"]
     contradicted = {alarm.sensor for alarm in worst if alarm.kind in ("axes", "clock")}  # in the check's own words
     worst = [alarm for alarm in worst if alarm.kind != "check" or alarm.sensor not in contradicted]
-    return [*worst, *sensors.contradictions(worst, start)]
+    return [*worst, *residuals.contradictions(worst, start)]
 
 
 def find_advice(numbers: Sequence[Statistic]) -> list[Alarm]:

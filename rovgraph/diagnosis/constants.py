@@ -5,17 +5,17 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import ndtri
 
-from rovgraph.calibration import TABLE
-from rovgraph.config import Config, beliefs
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.rate_noise import ARM
-from rovgraph.engine.released import Released, as_chain, release
-from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.estimate import CalibrationEstimate
+from rovgraph.inference.lever_arm_bias import ARM
+from rovgraph.inference.score_test import ScoreTest, as_chain, score_test
+from rovgraph.log.units import behind, shown
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config, beliefs
 from rovgraph.rules import RULES, START_REMEDY, remedy_of_lag
-from rovgraph.units import behind, shown
 
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
 LINEARISED = 0.2  # of a prior sd, by which linearisation may move what is hardly seen
@@ -37,7 +37,7 @@ RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "g
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
 
 
-def moved(evidence: Evidence) -> Iterator[Statistic]:
+def moved_calibration(evidence: Evidence) -> Iterator[Statistic]:
     """Calibration variables, first biases and the start against their priors, in sds of the shift (`sds_moved`)."""
     noise = _sd_of_noise(evidence)
     revealed = {label for name in evidence.initial.revealed.calibration for label in TABLE[name].labels}
@@ -143,18 +143,20 @@ def _moved(
     return Statistic("moved", sensor, begin, end, figure, cause, remedy, factor)
 
 
-def held(evidence: Evidence) -> Iterator[Statistic]:
-    """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
+def contradicted_constants(evidence: Evidence) -> Iterator[Statistic]:
+    """Constants that are held, released one by one: the score test of `rovgraph.inference.score_test`."""
     if evidence.optimum is not None:
         best = as_chain(evidence.optimum, evidence.initial)
         v_sd = np.median(evidence.main.trajectory.v_sd)
-        yield from held_in(best, evidence.initial.config, float(v_sd), evidence.start, evidence.end)
+        yield from contradicted_constants_in(best, evidence.initial.config, float(v_sd), evidence.start, evidence.end)
 
 
-def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: float) -> Iterator[Statistic]:
+def contradicted_constants_in(
+    best: ChainOptimum, config: Config, v_sd: float, start: float, end: float
+) -> Iterator[Statistic]:
     """The same of an optimum from ``start`` to ``end`` [s], whose velocity is known to ``v_sd`` [m/s]."""
     moving = np.sqrt(np.mean(best.state.v_n**2)) > MOVING * v_sd
-    for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
+    for r in score_test(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
         if r.sd > SHOWN_OF.get(r.name, SHOWN) * variable.sd:
             continue
@@ -201,7 +203,7 @@ def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
     )
 
 
-def halves(evidence: Evidence) -> Iterator[Statistic]:
+def split_half_drift(evidence: Evidence) -> Iterator[Statistic]:
     """The calibration of the first half of the dive against that of the whole, which is as much as against the second.
 
     The filter's estimate at half the dive differs from that of all data by a variance of P(half) - P(all).
@@ -255,7 +257,7 @@ def _key_of(name: str) -> str:
     return f"calibration.{name}"
 
 
-def _remedy_of_held(r: Released, config: Config) -> str:
+def _remedy_of_held(r: ScoreTest, config: Config) -> str:
     """What to do about a constant that is not what it is held at."""
     if r.name in TIME_OFFSETS:
         sensor = _sensor_of(r.name)

@@ -7,17 +7,17 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from rovgraph.check import Finding
-from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.lasting import Rival
-from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.problem import Problem
-from rovgraph.estimators.attitude_gaps import AttitudeGap
-from rovgraph.estimators.estimate import Estimate
+from rovgraph.diagnosis.check import Finding
 from rovgraph.geometry import Array
+from rovgraph.inference.attitude_gaps import AttitudeGap
+from rovgraph.inference.correlated_noise import Rival
+from rovgraph.inference.estimate import Estimate
+from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch
-from rovgraph.trajectory import Trajectory
+from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.problem import Problem
 
 MINUTE = 60.0  # [s]
 

@@ -1,17 +1,40 @@
-"""Alarms on the motion: the IMU against everything else, and the smoothed track against the filtered one."""
+"""Alarms on the motion: the IMU against everything else, and the smoothed track against the filtered one.
+
+Alarms on the choice between optima: a sensor that was ignored for some time, and a choice that was close.
+
+Why a DVL contradicts the IMU: axes that are swapped or turned round, or a clock that is off.
+
+Over a few seconds the IMU knows how the velocity changes. In body axes, with l the lever arm and T the time between
+two pings,
+
+    v_b(t) - R_b(t)b(t-T) v_b(t-T) = R_b(t)n (integral of R_nb f_b + g),  v_b = R_bs H z - w x l
+
+holds for the right signed permutation H of the DVL's axes and the right shift of its stamps. Only turns between the
+pings and the vertical enter, so it does not matter how wrong the heading is. But the estimate comes of the wrong DVL.
+The check of the log compares without an estimate, so its line is given where it finds something.
+"""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from math import exp, isfinite
 
 import numpy as np
 from scipy.special import chdtri
 
-from rovgraph.calibration import TABLE
 from rovgraph.diagnosis.alarm import Statistic
-from rovgraph.diagnosis.evidence import Evidence, windows
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.geometry import Array, wrap_angle
-from rovgraph.rules import CHANCE, RULES, SETTLED_S
-from rovgraph.trajectory import Trajectory
+from rovgraph.diagnosis.check.lags import ORIENTATIONS
+from rovgraph.diagnosis.evidence import Evidence, span, windows
+from rovgraph.geometry import Array, cross, rotate, transpose, wrap_angle
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.gauss_newton import FaultyInterval
+from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.kernels import motion_row
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import mount_matrix
+from rovgraph.problem.measurements import Measurements
+from rovgraph.rules import CHANCE, CLIPPED, CONTRADICTED, RULES, SETTLED_S, remedy_of_lag
+from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
 # of a motion's residual: what people call it, columns, and the signal behind it
@@ -22,7 +45,7 @@ COARSE = 300  # epochs at which both are compared
 LITTLE_M = 10.0  # an sd of so much may be all that a dive wants [m]
 
 
-def imu(evidence: Evidence) -> Iterator[Statistic]:
+def imu_disagreement(evidence: Evidence) -> Iterator[Statistic]:
     """Residuals of the IMU's factors: the mean of each axis over a time, squared, against that of noise.
 
     What is left between two keyframes is next to nothing, since the keyframes follow the IMU. What lasts is not.
@@ -114,7 +137,7 @@ def rms_of(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def found(evidence: Evidence) -> Iterator[Statistic]:
+def found_noise(evidence: Evidence) -> Iterator[Statistic]:
     """How far what was found in the dive has moved its track: noise that matters to nothing is no evidence of error."""
     track, before = evidence.main.trajectory, evidence.before
     if before is None or len(before) != len(track):
@@ -176,7 +199,7 @@ def uncertain(evidence: Evidence) -> Iterator[Statistic]:
     )
 
 
-def estimates(evidence: Evidence) -> Iterator[Statistic]:
+def filter_smoother_separation(evidence: Evidence) -> Iterator[Statistic]:
     """Smoothed against filtered position, depth and heading, in joint sds.
 
     Squared, the difference of a healthy pair is below a chi-square variable: its variance is P_f - P_s, and P_f + P_s
@@ -185,10 +208,10 @@ def estimates(evidence: Evidence) -> Iterator[Statistic]:
     smoothed, filtered = evidence.estimate("smoothed"), evidence.estimate("filtered")
     if smoothed is None or filtered is None or len(smoothed.trajectory) != len(filtered.trajectory):
         return
-    yield from apart(smoothed.trajectory, filtered.trajectory, evidence.start)
+    yield from separation_of(smoothed.trajectory, filtered.trajectory, evidence.start)
 
 
-def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
+def separation_of(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
     """A smoothed and a filtered track of the same epochs, of a dive that began at ``start`` [s]."""
     at = np.flatnonzero(s.time >= start + SETTLED_S)
     at = at[:: max(len(at) // COARSE, 1)]
@@ -224,3 +247,135 @@ def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
             f"at {float(s.time[at[k]]) - start:.0f} s",
             "later measurements contradict the filter: look at the residuals before that time",
         )
+
+
+def excluded_intervals(evidence: Evidence) -> Iterator[Statistic]:
+    """Intervals in which a sensor contradicts all others, of `rovgraph.inference.faulty_intervals`."""
+    for stretch in () if evidence.optimum is None else evidence.optimum.solution.stretches:
+        yield excluded_interval(stretch, evidence.start)
+
+
+def excluded_interval(stretch: FaultyInterval, start: float) -> Statistic:
+    """One such interval; ``start`` is when the dive started [s]."""
+    return Statistic(
+        "taken out",
+        stretch.sensor,
+        stretch.begin,
+        stretch.end,
+        stretch.end - stretch.begin,
+        f"contradicts all other sensors, {span(stretch.begin, stretch.end, start)}, and was ignored there",
+        "check the instrument at that time: a bias, a false lock, water instead of the bottom; an error that grew "
+        "slowly may have started earlier",
+    )
+
+
+def ambiguous_optimum(evidence: Evidence) -> Iterator[Statistic]:
+    """Likelihood of the next best optimum against the one that was chosen."""
+    if evidence.optimum is None or not isfinite(evidence.optimum.solution.runner_up):
+        return
+    margin = evidence.optimum.solution.runner_up
+    yield Statistic(
+        "close",
+        "dive",
+        evidence.start,
+        evidence.end,
+        exp(-margin),
+        f"sensors contradict each other, and a cost difference of only {margin:.1f} decided which one to ignore",
+        "check the rejected sensors, and remove the wrong one from the log",
+    )
+
+
+OVER_S = 3.0  # T
+SHIFTS_S, SHIFT_SD_S = np.arange(-2.0, 2.01, 0.05), 0.1 / 3.0
+ENOUGH = 50  # pings
+UNTIL_THEN = "until that is mended the track is wrong"
+
+
+def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
+    """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
+    best, config = evidence.optimum, evidence.initial.config
+    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < CONTRADICTED:
+        return
+    compared = _Compared.of(best, best.blocks["dvl"])
+    if compared is None:
+        return
+    R_bs = mount_matrix(config.dvl.mount_rpy_deg)
+    as_configured = compared.error(np.eye(3), R_bs, 0.0)
+    turned = [compared.error(H, R_bs, 0.0) for H in ORIENTATIONS]
+    shifted = {float(s): compared.error(np.eye(3), R_bs, float(s)) for s in SHIFTS_S}
+    shift = min(shifted, key=lambda s: shifted[s])
+    if min(turned) < shifted[shift]:
+        cause, remedy = axes_remedy(ORIENTATIONS[int(np.argmin(turned))], R_bs)
+        figure, kind = as_configured / min(turned), "axes"
+    else:
+        late = "late" if shift > 0 else "early"
+        cause = f"its stamps are about {abs(shift):.2g} s {late} relative to the IMU's"
+        remedy = remedy_of_lag(config, "dvl", shift, SHIFT_SD_S)
+        figure, kind = as_configured / shifted[shift], "clock"
+    text = f"{cause}; corrected, it agrees {figure:.1f} times better with the IMU"
+    found = Statistic(kind, "dvl", evidence.start, evidence.end, figure, text, remedy)
+    of_dvl = [f for f in evidence.findings if f.wrong and (f.sensor == "dvl" or f.kind == "jump")]
+    named = [f for f in of_dvl if f.kind == "axes" or f.of_clock]
+    if found.severity and named:
+        kind, text = "clock" if named[0].of_clock else "axes", "; ".join(finding.text for finding in named)
+        found = replace(found, kind=kind, cause=text, remedy=UNTIL_THEN)
+    yield found
+
+
+class _Compared:
+    """Pings a few seconds apart, and how the IMU says that the velocity changed between them.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,), of the pings [s]
+    z, swing_b : ndarray, shape (n, 3), what they measured, averaged, and the velocity of the lever arm [m/s]
+    before : ndarray of int, shape (m,), for each of the last m pings the one some seconds before
+    turn : ndarray, shape (m, 3, 3), from body axes then to those now
+    change_b : ndarray, shape (m, 3), of the velocity, by the IMU, in the body axes now [m/s]
+    """
+
+    def __init__(self, time: Array, z: Array, swing_b: Array, pairs: tuple[Array, Array], turn: Array, change_b: Array):
+        self.time, self.z, self.swing_b, self.turn, self.change_b = time, z, swing_b, turn, change_b
+        self.before, self.now = pairs
+
+    @staticmethod
+    def of(best: Optimum, block: Measurements) -> "_Compared | None":
+        problem, state = best.problem, best.state
+        model = block.instrument.model
+        if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(problem) < 3:
+            return None
+        dv, seconds = problem.motions[:, motion_row.VELOCITY], problem.motions[:, motion_row.DURATION]
+        gravity = np.array([0.0, 0.0, block.gravity])
+        force_n = rotate(state.R_nb[:-1], dv - state.bias[:-1, :3] * seconds[:, None])
+        velocity_n = np.vstack([np.zeros(3), np.cumsum(force_n + gravity * seconds[:, None], axis=0)])
+        broken = np.cumsum(problem.bridged)
+        k = block.keyframe.astype(np.int64)
+        now = np.arange(len(block))
+        before = np.searchsorted(block.time, block.time - OVER_S)
+        apart = block.time - block.time[before]
+        chosen = (apart > 0.5 * OVER_S) & (apart < 1.5 * OVER_S) & (broken[k] == broken[k[before]])
+        now, before = now[chosen], before[chosen]
+        if len(now) < ENOUGH:
+            return None
+        R_bn = transpose(state.R_nb[k[now]])
+        rate_b = block.rate_b - state.bias[k, 3:]
+        swing_b = cross(rate_b, np.broadcast_to(model.lever_arm_b, rate_b.shape))
+        change_b = rotate(R_bn, velocity_n[k[now]] - velocity_n[k[before]])
+        return _Compared(block.time, _averaged(block.z), swing_b, (before, now), R_bn @ state.R_nb[k[before]], change_b)
+
+    def error(self, H: Array, R_bs: Array, shift: float) -> float:
+        """Mean square of the differences, for axes H and stamps that are late by ``shift`` [m^2/s^2]."""
+        z = self.z if shift == 0.0 else _at(self.time + shift, self.time, self.z)
+        v_b = rotate(R_bs @ H, z) - self.swing_b
+        off = np.sum((v_b[self.now] - rotate(self.turn, v_b[self.before]) - self.change_b) ** 2, axis=1)
+        return float(np.minimum(off, CLIPPED**2 * max(float(np.median(off)), 1e-12)).mean())
+
+
+def _averaged(z: Array) -> Array:
+    """Means of five pings around each: a shift interpolates, which would lower the noise of single pings, too."""
+    padded = np.pad(z, ((2, 2), (0, 0)), mode="edge")
+    return np.asarray(sum(padded[k : k + len(z)] for k in range(5)) / 5.0)
+
+
+def _at(when: Array, time: Array, values: Array) -> Array:
+    return np.column_stack([np.interp(when, time, column) for column in values.T])

@@ -10,6 +10,11 @@ The factor of white noise comes from differences of successive residuals, which 
     factor^2 = median |r_k+1 - r_k|^2 / (2 m)
 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
+
+The place of a DVL that is elsewhere than the configuration has it, by the vehicle's own rates.
+
+Where the gyro's noise would move the DVL's arm if it were estimated, it is considered, and stays at its mean however
+far off that is (`rovgraph.inference.lever_arm_bias`). The score test without that noise says where the DVL is instead.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,20 +24,75 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from rovgraph.calibration import AUTO, TABLE
-from rovgraph.config import Config
 from rovgraph.diagnosis import Alarm, Statistic
-from rovgraph.diagnosis.dvl_place import DvlPlace, other_place
+from rovgraph.diagnosis.constants import FEIGNED, RELEASED
 from rovgraph.diagnosis.residuals import SD_KEY
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import rejects
-from rovgraph.engine.initial_conditions import Beliefs
-from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting
-from rovgraph.engine.rate_noise import ARM
-from rovgraph.engine.widened_chain import lasting_belief
 from rovgraph.geometry import Array
-from rovgraph.rules import BENT
-from rovgraph.units import behind, shown
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival, find_correlated_noise
+from rovgraph.inference.gauss_newton import rejects
+from rovgraph.inference.lever_arm_bias import ARM
+from rovgraph.inference.score_test import score_test
+from rovgraph.inference.widened_chain import lasting_belief
+from rovgraph.log.units import behind, shown
+from rovgraph.model.calibration import AUTO, MOUNT, TABLE
+from rovgraph.model.config import Config
+from rovgraph.problem.initial_conditions import Beliefs
+from rovgraph.rules import BENT, RULES
+
+
+@dataclass(frozen=True)
+class DvlPlace:
+    """Where the DVL is.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (3,), from where the configuration has it, along b; 0 where nothing shows [m]
+    mean : ndarray, shape (3,), of `ARM`, that puts it there [m]
+    sd : of each component, at least the prior's [m]
+    size : of the largest offset, in sds of the prior
+    """
+
+    offset: Array
+    mean: Array
+    sd: float
+    size: float
+
+    @property
+    def cause(self) -> str:
+        """What is so, in words."""
+        named = zip(TABLE[ARM].labels, self.offset.tolist(), strict=True)
+        where = ", ".join(f"{label[-1]} {off:+.2g} m" for label, off in named if off)
+        return (
+            f"the vehicle's rates show it elsewhere, {where} from where dvl.lever_arm_m, imu.lever_arm_m and "
+            f"calibration.{ARM}.mean have it"
+        )
+
+
+def estimate_lever_arm(best: ChainOptimum) -> DvlPlace | None:
+    """The place of a DVL that is considered, where it is another and no constant that is held is further off."""
+    if ARM not in best.unknowns.considered or _is_turned(best):
+        return None
+    belief, released = best.beliefs[ARM], score_test(best, RELEASED)
+    spread = {r.label: float(np.hypot(r.sd, FEIGNED.get(r.name, 0.0))) for r in released}
+    arm = [r for r in released if r.name == ARM and abs(r.step) > RULES["held"].doubtful * spread[r.label]]
+    # a place that is off makes stamps seem late: the arm is compared without what errors in variables allow for
+    others = [abs(r.step) / spread[r.label] for r in released if r.name != ARM]
+    if not arm or max(r.significance for r in arm) < max(others, default=0.0):
+        return None
+    steps = {r.label: r.step for r in arm}
+    offset = np.array([steps.get(label, 0.0) for label in belief.variable.labels])
+    sd = max(belief.sd, *(spread[r.label] for r in arm))
+    return DvlPlace(offset, belief.mean + offset, sd, float(np.abs(offset).max() / belief.sd))
+
+
+def _is_turned(best: ChainOptimum) -> bool:
+    """Whether the DVL's mounting is estimated far from its prior, as it is where axes are named wrongly."""
+    own = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
+    return any(
+        abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > RULES["moved"].doubtful * b.sd for b in own
+    )
+
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
 ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
@@ -105,7 +165,7 @@ def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> 
         return [], []
     late = {alarm.sensor: alarm.figure for alarm in alarms if alarm.kind == "held" and alarm.sensor in ALONE}
     stated = [name for name in LASTING if getattr(config.calibration, name).estimate != AUTO]
-    errors, rivals = find_lasting(best, stated)
+    errors, rivals = find_correlated_noise(best, stated)
     place = _place(best, alarms)
     if place is not None and any(error.sensor == "dvl" for error in errors):
         return [_placed(best, place)], []
@@ -130,7 +190,7 @@ def _named_elsewhere(alarms: Sequence[Alarm], best: ChainOptimum) -> bool:
 
 
 def _place(best: ChainOptimum, alarms: Sequence[Alarm]) -> DvlPlace | None:
-    return None if any(alarm.kind in ("axes", "clock") for alarm in alarms) else other_place(best)
+    return None if any(alarm.kind in ("axes", "clock") for alarm in alarms) else estimate_lever_arm(best)
 
 
 def _placed(best: ChainOptimum, place: DvlPlace) -> UnstatedNoise:
@@ -199,7 +259,7 @@ def _is_stated(best: ChainOptimum, sensor: str) -> bool:
     return bool(np.median(np.abs(sd / believed - 1.0)) < OWN_SD)
 
 
-def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
+def _lasting(best: ChainOptimum, error: GaussMarkovError) -> UnstatedNoise:
     variable = TABLE[error.variable]
     factor, unit = shown(variable.unit)
     sd, seconds = factor * error.sd, float(error.time_constant)

@@ -1,14 +1,14 @@
 """Measurements in the order of time become keyframes, the motion between them, and rows of numbers.
 
-A keyframe stands at every DVL ping, and wherever `Rule.max_gap` passes without one. A ping that comes up to
-`Rule.longest` after the last keyframe makes the keyframe itself: where the period of pings is about ``max_gap``,
-rounding would otherwise decide whether a ping has a keyframe. Where samples of the IMU are missing there is one at the
-first sample after them, so that nothing is carried through a gap. Without an IMU every measurement makes one, but for
-what is within `Rule.min_gap` of one.
+A keyframe stands at every DVL ping, and wherever `KeyframeRule.max_gap` passes without one. A ping that comes up to
+`KeyframeRule.longest` after the last keyframe makes the keyframe itself: where the period of pings is about
+``max_gap``, rounding would otherwise decide whether a ping has a keyframe. Where samples of the IMU are missing there
+is one at the first sample after them, so that nothing is carried through a gap. Without an IMU every measurement makes
+one, but for what is within `KeyframeRule.min_gap` of one.
 
 Any other measurement belongs to the keyframe before it and carries the motion from there to its own time. What is
-looked at has waited until the samples reach `Rule.around` past it, so its rate can be fitted through samples on either
-side. Some sensors count once between two keyframes, the first time: their errors last longer than that.
+looked at has waited until the samples reach `KeyframeRule.around` past it, so its rate can be fitted through samples
+on either side. Some sensors count once between two keyframes, the first time: their errors last longer than that.
 
 A measurement stands at its stamp less the time offset that is assumed; what remains until the one that is estimated is
 bridged by a window, the motion at knots around the stamp, as far as the prior reaches.
@@ -46,22 +46,23 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels import motion_row
-from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.compile import Index, IndexMatrix, Matrices, Matrix, Vector, helper, kernel
-from rovgraph.kernels.imu_samples import (
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.measurement_row import ASSUMED, KNOT_LAG, KNOT_RATE, MOST, RATE, RATE_SD, SNAPSHOT, Z
+from rovgraph.kernels.measurement_row import TIME as AT
+from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR
+from rovgraph.kernels.motion_residual import motion_weight
+from rovgraph.kernels.preintegration import (
     HALF_WINDOW_S,
+    first_after,
     first_not_before,
     fit_rate,
+    integrate,
     mean_signal,
     survey,
     typical_scatter,
 )
-from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.measurement_row import ASSUMED, KNOT_LAG, KNOT_RATE, MOST, RATE, RATE_SD, SNAPSHOT, Z
-from rovgraph.kernels.measurement_row import TIME as AT
-from rovgraph.kernels.motion_residual import motion_weight
 from rovgraph.kernels.preintegration import SNAPSHOT as NUMBERS
-from rovgraph.kernels.preintegration import first_after, integrate
 
 STAMP, PLACED, SENSOR, LINE, NAME, FATE, VALUES = 0, 1, 2, 3, 4, 5, 6
 TIME, COUNT, UPTO, HERE, SEGMENT, BEGUN, RATE_B, SPREAD, FIRST, LAST = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11
@@ -81,7 +82,7 @@ INTERVALS, ENOUGH = 200, 20  # the newest intervals that show it, and how many a
 CHANGED = 0.05  # part by which densities have to differ to be taken
 
 
-class Rule(NamedTuple):
+class KeyframeRule(NamedTuple):
     """Where keyframes stand, and how an interval is integrated.
 
     Attributes
@@ -140,7 +141,7 @@ class Integration(NamedTuple):
     lags: Matrix
 
 
-class Dive(NamedTuple):
+class DiveArrays(NamedTuple):
     """A dive of n keyframes and m measurements, with room for more.
 
     Attributes
@@ -198,7 +199,7 @@ def _read(streams: Streams, assumed: Array, before: float, counts: Index) -> Non
 
 
 @helper
-def _stand(dive: Dive, rule: Rule, time: float, upto: int, here: int) -> None:
+def _stand(dive: DiveArrays, rule: KeyframeRule, time: float, upto: int, here: int) -> None:
     """Have a keyframe stand at a time, with the events up to ``upto``, ``here`` of which are at it."""
     n = dive.counts[KEYFRAMES]
     row = dive.keyframes[n]
@@ -214,7 +215,7 @@ def _stand(dive: Dive, rule: Rule, time: float, upto: int, here: int) -> None:
 
 
 @helper
-def _silence(streams: Streams, dive: Dive, rule: Rule, time: float, longest: float, looked: int) -> None:
+def _silence(streams: Streams, dive: DiveArrays, rule: KeyframeRule, time: float, longest: float, looked: int) -> None:
     """Keyframes for a time without pings, wherever it is longer than ``longest`` [s]."""
     while time - dive.keyframes[dive.counts[KEYFRAMES] - 1, TIME] > longest:
         last = dive.keyframes[dive.counts[KEYFRAMES] - 1]
@@ -225,7 +226,7 @@ def _silence(streams: Streams, dive: Dive, rule: Rule, time: float, longest: flo
 
 
 @helper
-def _look(streams: Streams, dive: Dive, rule: Rule, until: float) -> None:
+def _look(streams: Streams, dive: DiveArrays, rule: KeyframeRule, until: float) -> None:
     """Place what has waited for the IMU up to a time."""
     imu, events, order, counts = streams.imu, streams.events, streams.order, dive.counts
     start, looked = dive.keyframes[counts[KEYFRAMES] - 1, TIME], int(dive.keyframes[counts[KEYFRAMES] - 1, UPTO])
@@ -270,7 +271,7 @@ def _look(streams: Streams, dive: Dive, rule: Rule, until: float) -> None:
 
 
 @helper
-def _finish(streams: Streams, dive: Dive, rule: Rule) -> None:
+def _finish(streams: Streams, dive: DiveArrays, rule: KeyframeRule) -> None:
     """Place the rest, and a last keyframe at the last sample; says what lies beyond them."""
     events, order, counts = streams.events, streams.order, dive.counts
     end = streams.imu[counts[SAMPLES] - 1, 0]
@@ -289,7 +290,7 @@ def _finish(streams: Streams, dive: Dive, rule: Rule) -> None:
 
 
 @helper
-def _next_due(streams: Streams, assumed: Array, rule: Rule, dive: Dive) -> float:
+def _next_due(streams: Streams, assumed: Array, rule: KeyframeRule, dive: DiveArrays) -> float:
     """From when on a keyframe may be past, by the events that have come [s]."""
     counts, events = dive.counts, streams.events
     if counts[KEYFRAMES] == 0:
@@ -308,7 +309,7 @@ def _next_due(streams: Streams, assumed: Array, rule: Rule, dive: Dive) -> float
 
 @kernel()
 def place_keyframes(
-    streams: Streams, assumed: Vector, rule: Rule, dive: Dive, until: int, one: bool, finish: bool
+    streams: Streams, assumed: Vector, rule: KeyframeRule, dive: DiveArrays, until: int, one: bool, finish: bool
 ) -> float:
     """Where keyframes stand, as samples come one after the other.
 
@@ -480,7 +481,7 @@ def _mean_rate(imu: Array, angle: Array, time: float, half: float, mean_out: Arr
 
 
 @helper
-def _in_view(dive: Dive, rule: Rule, row: int, name: float, time: float) -> bool:
+def _in_view(dive: DiveArrays, rule: KeyframeRule, row: int, name: float, time: float) -> bool:
     """Whether a place has counted just now; rows before ``row`` are looked at."""
     j = row - 1
     while j >= 0 and dive.rows[j, AT] > time - rule.every_s - rule.longest:
@@ -491,7 +492,9 @@ def _in_view(dive: Dive, rule: Rule, row: int, name: float, time: float) -> bool
 
 
 @helper
-def _motion(streams: Streams, rule: Rule, integration: Integration, dive: Dive, k: int, longest_step: float) -> None:
+def _motion(
+    streams: Streams, rule: KeyframeRule, integration: Integration, dive: DiveArrays, k: int, longest_step: float
+) -> None:
     """What is believed of the interval that ends with keyframe k, to integrate it."""
     keyframe, row = dive.keyframes[k], dive.motions[k]
     imu = streams.imu[int(keyframe[FIRST]) : int(keyframe[LAST])]
@@ -523,7 +526,9 @@ def _motion(streams: Streams, rule: Rule, integration: Integration, dive: Dive, 
 
 
 @helper
-def _between(streams: Streams, rule: Rule, dive: Dive, k: int, pieces: Array, chosen: Index, out: Array) -> int:
+def _between(
+    streams: Streams, rule: KeyframeRule, dive: DiveArrays, k: int, pieces: Array, chosen: Index, out: Array
+) -> int:
     """What is measured between keyframe k and the one before, in the order of time; how many.
 
     ``chosen`` are places in the events, or of pieces, less than zero; ``out`` are their times.
@@ -554,9 +559,9 @@ def _between(streams: Streams, rule: Rule, dive: Dive, k: int, pieces: Array, ch
 @helper
 def _take(
     streams: Streams,
-    rule: Rule,
+    rule: KeyframeRule,
     integration: Integration,
-    dive: Dive,
+    dive: DiveArrays,
     k: int,
     here: bool,
     event: Array,
@@ -615,7 +620,9 @@ def _take(
 
 
 @kernel()
-def assemble(streams: Streams, pieces: Matrix, rule: Rule, integration: Integration, dive: Dive, begin: int) -> None:
+def assemble(
+    streams: Streams, pieces: Matrix, rule: KeyframeRule, integration: Integration, dive: DiveArrays, begin: int
+) -> None:
     """Motions, measurements and their windows, of the keyframes that stand from ``begin`` on.
 
     Parameters

@@ -1,6 +1,6 @@
 """What an eliminated chain says, backwards in time: solution, sensitivities, draws and covariances.
 
-From the conditionals of `rovgraph.kernels.linear_chain.eliminate`,
+From the conditionals of `rovgraph.kernels.elimination.eliminate`,
 
     R_k x_k + S_k x_{k+1} + T_k y = z_k + white noise
 
@@ -11,8 +11,8 @@ in the notation of that module. Covariances are sums of squares, as in the smoot
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.kernels.chain import padded
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.householder import padded
 
 
 @kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
@@ -24,7 +24,7 @@ def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
 
     Parameters
     ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.linear_chain.eliminate`
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.elimination.eliminate`
     y : shape (c, m)
     x_out : shape (n, d, m), z to begin with, then x
     """
@@ -93,7 +93,7 @@ def covariances(conditionals: Array, P_y: Array, P_out: Array, cross_out: Array,
 
     Parameters
     ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.linear_chain.eliminate`
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.elimination.eliminate`
     P_y : shape (c, c), covariance of the border
     P_out : shape (n, d, d)
     cross_out : shape (n, d, c), of the keyframes (rows) with the border, X P_y; or (0, d, c)

@@ -71,7 +71,7 @@ class Aiding(NamedTuple):
     reference: Matrices
 
 
-class Start(NamedTuple):
+class LevelStart(NamedTuple):
     """Before the first epoch.
 
     Attributes
@@ -114,7 +114,7 @@ class Reckoned(NamedTuple):
     bias: Array
 
 
-class Chain(NamedTuple):
+class AxisFilter(NamedTuple):
     """Covariance of one chain, shape (3, 3), and what is kept of the sensor that corrects it, shape (3,)."""
 
     P: Array
@@ -193,7 +193,7 @@ def _propagate_attitude(known: Reckoned, dR: Array, dv: Array, outage: bool, wor
 
 
 @helper
-def _clip(chain: Chain, innovation: float, sd: float, by_angle: float) -> float:
+def _clip(chain: AxisFilter, innovation: float, sd: float, by_angle: float) -> float:
     """Share of an innovation that is used; inflates the covariance of the angle where it stays too large.
 
     A clipped innovation corrects neither drift nor deviation: it may be wrong itself. After `INFLATE_AFTER_S` of them
@@ -215,7 +215,7 @@ def _clip(chain: Chain, innovation: float, sd: float, by_angle: float) -> float:
 
 
 @helper
-def _correct_tilt(known: Reckoned, chain: Chain, v_b: Array, variance: float, gravity: float, work: Array) -> None:
+def _correct_tilt(known: Reckoned, chain: AxisFilter, v_b: Array, variance: float, gravity: float, work: Array) -> None:
     """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
     R, v_n, bias = known
     measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
@@ -234,7 +234,7 @@ def _correct_tilt(known: Reckoned, chain: Chain, v_b: Array, variance: float, gr
 
 
 @helper
-def _correct_heading(known: Reckoned, chain: Chain, innovation: float, variance: float, work: Array) -> None:
+def _correct_heading(known: Reckoned, chain: AxisFilter, innovation: float, variance: float, work: Array) -> None:
     """Heading, the vertical bias of the gyro and the compass's deviation corrected by a compass."""
     R, v_n, bias = known
     gain = work[0, 1]
@@ -262,14 +262,18 @@ def _angle_about_down(R: Array, reference: Array) -> float:
 
 @kernel()
 def reckon_attitude(
-    motions: Motions, aiding: Aiding, start: Start, around: Surroundings, R_out: Matrices, bias_out: Matrix
+    motions: Motions, aiding: Aiding, start: LevelStart, around: Surroundings, R_out: Matrices, bias_out: Matrix
 ) -> None:
     """Attitude and gyro bias at m epochs, shapes (m, 3, 3), (m, 3), each after the measurement that it has."""
     outage, dt, dR, dv, assumed, density = motions
     dvl, compass, reference = aiding
     gravity, valid_s, held, deviation_var, w_ie_n, arm = around
     R, bias, v_n, v_b = start.R.copy(), start.bias.copy(), np.zeros(3), np.zeros(3)
-    tilt, heading, since_ping = Chain(start.P[0].copy(), np.zeros(3)), Chain(start.P[1].copy(), np.zeros(3)), 0.0
+    tilt, heading, since_ping = (
+        AxisFilter(start.P[0].copy(), np.zeros(3)),
+        AxisFilter(start.P[1].copy(), np.zeros(3)),
+        0.0,
+    )
     known, dvl_history, compass_history = Reckoned(R, v_n, bias), tilt.history, heading.history
     work, turn, moved = np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(len(dt)):

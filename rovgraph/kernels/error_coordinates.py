@@ -21,7 +21,13 @@ of the pose and of each y_s differ from the unit matrix:
     B_R = B_p = R'^T R,    H_s' B = H_s,  so  B_s = Y'^-1 (H_s - (H_s' without Y') B)
 
 An instrument sees one variable y_s and depends on no other that is seen. Which ones these are stands in
-`rovgraph.engine.error_layout`.
+`rovgraph.inference.filter`.
+
+P <- B P B' for a basis B of which few rows differ from the unit matrix.
+
+With T = B P, of which only those rows are calculated, and from what is not zero in them,
+
+    (B P B')_ri = T_ri for a row r of those and any other i,    (B P B')_rq = sum over k of T_rk B_qk
 """
 
 from typing import NamedTuple
@@ -30,10 +36,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compass import wrap
 from rovgraph.kernels.compile import Index, IndexMatrix, Matrix, helper, view_helper
 from rovgraph.kernels.layout import ACC_BIAS, MOTION, TRANSLATION, VELOCITY
-from rovgraph.kernels.measurements import WORK, is_angular, predict
+from rovgraph.kernels.measurements import WORK, is_angular, predict, wrap
 from rovgraph.kernels.rotations import (
     exp_rotation,
     log_rotation,
@@ -47,7 +52,7 @@ from rovgraph.kernels.states import Epoch
 Indices = NDArray[np.int64]
 
 
-class ErrorLayout(NamedTuple):
+class ErrorColumns(NamedTuple):
     """What of the calibration is estimated, and what the instruments see.
 
     Attributes
@@ -66,8 +71,8 @@ class ErrorLayout(NamedTuple):
     rows: Index
 
 
-class Scratch(NamedTuple):
-    """Arrays to calculate with, for one `ErrorLayout`.
+class ErrorScratch(NamedTuple):
+    """Arrays to calculate with, for one `ErrorColumns`.
 
     Attributes
     ----------
@@ -84,14 +89,14 @@ TURN, STEP, REST, ZERO = WORK, WORK + 1, WORK + 2, WORK + 3  # matrices of ``wor
 
 
 @helper
-def make_scratch(instruments: int, calibration_size: int) -> Scratch:
+def make_scratch(instruments: int, calibration_size: int) -> ErrorScratch:
     """Arrays for `retract` and `local` of so many instruments; made once."""
     H = np.zeros((2, instruments, 3, MOTION + calibration_size))
-    return Scratch(np.zeros((2, instruments, 3)), H, np.zeros((WORK + 4, 3, 3)))
+    return ErrorScratch(np.zeros((2, instruments, 3)), H, np.zeros((WORK + 4, 3, 3)))
 
 
 @view_helper
-def _see(s: int, which: int, state: Epoch, layout: ErrorLayout, scratch: Scratch) -> None:
+def _see(s: int, which: int, state: Epoch, layout: ErrorColumns, scratch: ErrorScratch) -> None:
     """What instrument ``s`` sees of a state."""
     z, H, rate = scratch.z[which, s], scratch.H[which, s], scratch.work[ZERO, 0]
     predict(layout.seen[s, 0], state, rate, layout.params[s], z, H, scratch.work)
@@ -158,7 +163,7 @@ def _rows_of_seen(
 
 
 @view_helper
-def retract(state: Epoch, delta: Array, layout: ErrorLayout, scratch: Scratch, basis_out: Array) -> None:
+def retract(state: Epoch, delta: Array, layout: ErrorColumns, scratch: ErrorScratch, basis_out: Array) -> None:
     """Move a state by ``delta``, in place.
 
     ``basis_out``, shape (size, size), takes an error about the old state over to the new one, to first order in
@@ -223,7 +228,7 @@ def _product(row: Array, delta: Array, columns: Indices) -> float:
 
 @view_helper
 def local(
-    state: Epoch, other: Epoch, layout: ErrorLayout, scratch: Scratch, delta_out: Array, basis_out: Array
+    state: Epoch, other: Epoch, layout: ErrorColumns, scratch: ErrorScratch, delta_out: Array, basis_out: Array
 ) -> None:
     """The error that leads from a state to another one: the inverse of `retract`.
 
@@ -256,3 +261,63 @@ def local(
             for i in range(dim):
                 delta_out[first + i] += inverse[i, k] * apart[k]
         _rows_of_seen(there, here, inverse, turn, first, dim, columns, basis_out)
+
+
+@view_helper
+def change_basis(P: Array, basis: Array, rows: Indices, product: Array, filled: Indices) -> None:
+    """P <- B P B' in place.
+
+    Parameters
+    ----------
+    P : ndarray, shape (d, d), symmetric; may be wider than the basis, which leaves the rest as it is
+    basis : ndarray, shape (size, size)
+    rows : ndarray of int, shape (r,), rows of the basis that differ from the unit matrix
+    product : ndarray, shape (r, d or more), to calculate with
+    filled : ndarray of int, shape (r, size + 1), to calculate with
+    """
+    for r in range(len(rows)):
+        _row_of_product(basis[rows[r]], P, product[r], filled[r])
+    for r in range(len(rows)):
+        row = rows[r]
+        for i in range(len(P)):
+            P[row, i] = P[i, row] = product[r, i]
+    for r in range(len(rows)):
+        for q in range(r + 1):
+            other, columns, total = basis[rows[q]], filled[q], 0.0
+            for k in range(1, columns[0] + 1):
+                total += product[r, columns[k]] * other[columns[k]]
+            P[rows[r], rows[q]] = P[rows[q], rows[r]] = total
+
+
+@view_helper
+def turn_rows(A: Array, basis: Array, rows: Indices, product: Array) -> None:
+    """A <- B A in place, shape (d, h), for a basis B as of `change_basis`; ``product`` (r, h) is to calculate with."""
+    for r in range(len(rows)):
+        row = basis[rows[r]]
+        for k in range(A.shape[1]):
+            product[r, k] = 0.0
+            for j in range(len(row)):
+                product[r, k] += row[j] * A[j, k]
+    for r in range(len(rows)):
+        for k in range(A.shape[1]):
+            A[rows[r], k] = product[r, k]
+
+
+@view_helper
+def _row_of_product(row: Array, P: Array, product_out: Array, filled_out: Indices) -> None:
+    """A row of B times P; which columns of the row are not zero, behind their number."""
+    count = 0
+    for i in range(len(P)):
+        product_out[i] = 0.0
+    for j in range(len(row)):
+        if row[j] != 0.0:
+            count += 1
+            filled_out[count] = j
+            _add_scaled(row[j], P[j], product_out)
+    filled_out[0] = count
+
+
+@view_helper
+def _add_scaled(factor: float, v: Array, sum_out: Array) -> None:
+    for i in range(len(v)):
+        sum_out[i] += factor * v[i]

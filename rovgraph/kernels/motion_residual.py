@@ -5,8 +5,8 @@ predicts, (R, p, v), seen from the keyframe after, and the change of bias:
 
     phi = Log(R_j' R),  r = (phi, Jl(phi)^-1 R_j' (p - p_j), Jl(phi)^-1 R_j' (v - v_j), b_i - b_j)
 
-Of an interval that is coasted through it is that of `rovgraph.kernels.coasting`, without an IMU that of
-`rovgraph.kernels.cruising`.
+Of an interval that is coasted through it is that of `rovgraph.kernels.motion`, without an IMU that of
+`rovgraph.kernels.motion`.
 """
 
 import math
@@ -15,12 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.coasting import coasting_covariance, coasting_error
 from rovgraph.kernels.compile import Matrices, Matrix, helper, kernel, view_helper
-from rovgraph.kernels.cruising import cruising_covariance, cruising_error
 from rovgraph.kernels.layout import ACC_BIAS
 from rovgraph.kernels.motion import (
     MotionScratch,
+    coasting_covariance,
+    coasting_error,
+    cruising_covariance,
+    cruising_error,
     is_coasted,
     is_cruising,
     make_motion_scratch,

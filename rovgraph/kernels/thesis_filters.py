@@ -129,7 +129,7 @@ def _whiten(S: Array, W: Array, e: Array) -> bool:
     return True
 
 
-class Innovations(NamedTuple):
+class FilterInnovations(NamedTuple):
     """One measurement of several filters.
 
     Attributes
@@ -147,7 +147,13 @@ class Innovations(NamedTuple):
 
 @kernel()
 def update(
-    x: Matrix, P: Matrices, found: Innovations, x_out: Matrix, P_out: Matrices, normalised_out: Matrix, sd_out: Matrix
+    x: Matrix,
+    P: Matrices,
+    found: FilterInnovations,
+    x_out: Matrix,
+    P_out: Matrices,
+    normalised_out: Matrix,
+    sd_out: Matrix,
 ) -> None:
     """One measurement; not finite where the innovation's covariance is not positive definite: the filter has diverged.
 

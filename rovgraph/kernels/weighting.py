@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import given, kernel, view_helper
+from rovgraph.kernels.compile import kernel, readonly_array, view_helper
 
 LOSSES = ("none", "huber", "cauchy")  # in the order of the numbers below
 NONE, HUBER, CAUCHY = range(3)
@@ -41,7 +41,7 @@ def whiten(sd: Array, rate_covariance: Array, rate_sd: float, W_out: Array) -> N
         W_out[i, i] = 1.0 / W_out[i, i]
 
 
-@kernel(f"void({given(2)}, f8[:, ::1], {given(1)}, f8[:, :, ::1])")
+@kernel(f"void({readonly_array(2)}, f8[:, ::1], {readonly_array(1)}, f8[:, :, ::1])")
 def whiten_many(sd: Array, rate_covariance: Array, rate_sd: Array, W_out: Array) -> None:
     """`whiten` of n measurements of one sensor: ``sd`` of shape (n, dim), ``rate_sd`` of shape (n,)."""
     one = np.empty(sd.shape[1])
@@ -72,7 +72,7 @@ def robust_cost(d2: float, loss: int, threshold: float) -> float:
     return 0.5 * d2
 
 
-@kernel(f"void({given(1)}, i8, f8, f8[::1], f8[::1])")
+@kernel(f"void({readonly_array(1)}, i8, f8, f8[::1], f8[::1])")
 def weight_many(d2: Array, loss: int, threshold: float, rho_out: Array, weight_out: Array) -> None:
     """`robust_cost` and `loss_weight` of n measurements."""
     for k in range(len(d2)):

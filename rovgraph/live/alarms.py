@@ -11,33 +11,32 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_advice, find_alarms, verdict_of
 from rovgraph.diagnosis.constants import earth_rate_of, moved_constant, sds_moved
 from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
-from rovgraph.diagnosis.motion import apart
+from rovgraph.diagnosis.motion import excluded_interval, separation_of
 from rovgraph.diagnosis.residuals import (
     ENOUGH,
-    lasting_in,
+    correlated_residuals_in,
+    frozen_for,
     rejected_in,
     share_rejected,
     too_large_in,
     too_small_in,
 )
-from rovgraph.diagnosis.sensors import frozen_for
-from rovgraph.diagnosis.stretches import taken_out_in
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, Met, states_of
-from rovgraph.engine.gauss_newton import Stretch
-from rovgraph.engine.problem import gathered
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
-from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import Array
-from rovgraph.live.faults import Watch
+from rovgraph.inference.estimate import CalibrationEstimate
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter_step import Gaussian, Met, states_of
+from rovgraph.inference.fixed_lag import FilterSnapshot
+from rovgraph.inference.gauss_newton import FaultyInterval
 from rovgraph.live.reinitialisations import Adopted
+from rovgraph.live.sensor_faults import Watch
 from rovgraph.live.solution import Event
+from rovgraph.model.calibration import LAYOUT, TABLE
+from rovgraph.model.state import BIAS, PLACE
+from rovgraph.problem.problem import gathered
 from rovgraph.rules import RULES, SETTLED_S
-from rovgraph.state import BIAS, PLACE
 
 EVERY_S = 5.0  # between looks
 LASTING_EVERY_S = 20.0  # between looks at what lasts, which cost more
@@ -155,17 +154,17 @@ class LiveAlarms:
         """The filter goes on from the smoothed dive so far."""
         time = float(adopted.smoothed.time[-1])
         if not np.isnan(self._start):
-            self._told += [(time, one) for one in apart(adopted.smoothed, adopted.filtered, self._start)]
+            self._told += [(time, one) for one in separation_of(adopted.smoothed, adopted.filtered, self._start)]
         self._shown = adopted.shown
 
     def forget_smoothed(self) -> None:
         """Another filter goes on: what the smoothed dive has shown is not of its sensors and priors."""
         self._shown = []
 
-    def taken_out(self, stretch: Stretch) -> None:
+    def taken_out(self, stretch: FaultyInterval) -> None:
         """A sensor is left out for some time."""
         if not np.isnan(self._start):
-            self._told.append((stretch.end, taken_out_in(stretch, self._start)))
+            self._told.append((stretch.end, excluded_interval(stretch, self._start)))
 
     def _statistics(
         self, known: Gaussian, engine: FilterEngine, watches: Mapping[str, Watch], time: float
@@ -215,7 +214,9 @@ class LiveAlarms:
             own = [piece[sensor] for piece in self._pieces if sensor in piece]
             names = "time", "normalised", "weight", "shared"
             arrays = (np.concatenate([getattr(one, name) for one in own]) for name in names)
-            found += lasting_in(SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start)
+            found += correlated_residuals_in(
+                SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start
+            )
             yield self._lasting
         yield found
 

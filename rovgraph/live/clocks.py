@@ -24,7 +24,7 @@ from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.live.message import Message
-from rovgraph.stamps import COUNTERS, counter_range
+from rovgraph.log.stamps import COUNTERS, counter_range
 
 AGREE_S = 0.5
 AGREE_SENT_S = 0.1

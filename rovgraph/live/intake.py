@@ -1,19 +1,32 @@
-"""From what a source says to measurements as the estimator takes them."""
+"""From what a source says to measurements as the estimator takes them.
+
+The first seconds: what an estimator has to know before it can begin.
+
+Sensors that begin after the first seconds: the filter goes on with what they need in its state.
+"""
 
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 import pymap3d
 
-from rovgraph.config import Config, Mag
+from rovgraph.diagnosis.check.values import angles, gravity, turn_rates
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, Reading
-from rovgraph.log import Measurement
-from rovgraph.log.streams import SPACING_S
+from rovgraph.log import Measurement, gathered
+from rovgraph.log.streams import SPACING_S, precedence
+from rovgraph.model.config import Config, Mag
+from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
+from rovgraph.sensors.instruments import instruments
 
 _STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
@@ -150,3 +163,111 @@ class Intake:
         ):
             self._patch = patch = _Patch.around(north, east, self.origin)
         return patch.at(north, east)
+
+
+MARGIN_S = 0.5  # beyond the window, for data that come late
+AGAIN_S = 1.0  # between attempts
+NEEDS_IMU = "online needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z"
+
+
+@dataclass
+class Startup:
+    """Collects measurements until a dive can begin.
+
+    Attributes
+    ----------
+    config : as the user gave it
+    waits_for : why it has not begun, one line; empty while the first seconds go by
+    doubts : what looks wrong with the first seconds, one line each
+    """
+
+    config: Config
+    waits_for: str = ""
+    measurements: list[Measurement] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    _next: float | None = None
+
+    def __post_init__(self) -> None:
+        if has_constant_velocity(self.config):
+            raise InputError(f"motion.model: constant_velocity is for recorded logs, {NEEDS_IMU}")
+
+    @property
+    def expects(self) -> str:
+        """What has to come before the dive can begin, or be different."""
+        if self.waits_for:
+            return self.waits_for
+        if self._next is None:
+            return "no measurement of an IMU yet"
+        return f"the first {WINDOW_S + MARGIN_S:g} s of the IMU go by"
+
+    def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> InitialConditions | None:
+        """Take a measurement; the beginning of the dive, once it is known.
+
+        Parameters
+        ----------
+        measurement : the next one
+        origin : latitude and longitude [deg] of north = east = 0, where they are known
+        """
+        self.measurements.append(measurement)
+        if measurement.sensor != "imu":
+            return None
+        if self._next is None:
+            self._next = measurement.time + WINDOW_S + MARGIN_S
+        if measurement.time < self._next:
+            return None
+        self._next = measurement.time + AGAIN_S
+        return self.begin(origin)
+
+    def begin(self, origin: tuple[float, float] | None) -> InitialConditions | None:
+        """The beginning from what is there, or None; then `waits_for` says why."""
+        self.measurements.sort(key=lambda m: (m.time, precedence(m.sensor)))
+        imu = [m.time for m in self.measurements if m.sensor == "imu"]
+        if not imu:
+            self.waits_for = NEEDS_IMU
+            return None
+        first = imu[-1] - WITHIN_S
+        self.measurements = [m for m in self.measurements if m.time >= first]
+        named = self.config.heading.sources is not None
+        later = [s for s in SENSORS.values() if s.may_begin_later]
+        expected = {s.name for s in later if s.heading_source is None or named}
+        log = gathered(self.measurements, "so far", origin)
+        try:
+            initial = initialise(log, self.config, expected)
+        except InputError as error:
+            self.waits_for = str(error)
+            return None
+        findings = [finding for check in (gravity, turn_rates, angles) for finding in check(log, self.config)]
+        self.doubts = [f"{finding.sensor}: {finding.text}" for finding in findings if finding.level != "ok"]
+        return initial
+
+
+LATE = ("dvl_water", "thruster")  # who has none shall not pay for a current in the filter's state
+ANYWHERE_M = 1e4  # sd of where a dive began that knows no fix
+
+
+def is_late(m: Measurement, engine: FixedLag) -> bool:
+    """Whether a measurement is of a sensor that the configuration has and the filter does not know."""
+    if m.sensor not in LATE or m.sensor in engine.initial.instruments:
+        return False
+    return m.sensor != "thruster" or engine.initial.config.graph.hydrodynamics
+
+
+def can_join(m: Measurement, engine: FixedLag) -> bool:
+    """Whether the filter can go on with its sensor from this measurement on."""
+    as_many = m.sensor != "thruster" or len(m.values) == len(engine.initial.config.vehicle.thrusters)
+    return as_many and bool(engine.snapshots) and bool(np.isfinite(m.values[:3]).all())
+
+
+def joined(engine: FixedLag, sensor: str) -> FixedLag:
+    """A filter that goes on with one sensor more."""
+    initial = engine.initial
+    more = instruments(initial.config, initial.config.imu.lever_arm_m)[sensor]
+    return engine.continued(replace(initial, instruments={**initial.instruments, sensor: more}))
+
+
+def unlocated(engine: FixedLag) -> FixedLag:
+    """A filter that goes on not knowing where it is, nor where it began: fixes will say."""
+    initial = engine.initial
+    p_sd = np.append(np.full(2, ANYWHERE_M), initial.prior.p_sd[2])
+    wide: InitialConditions = replace(initial, prior=replace(initial.prior, p_sd=p_sd))
+    return engine.continued(wide, ANYWHERE_M)

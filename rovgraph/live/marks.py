@@ -1,4 +1,7 @@
-"""Marks and way-points that a person drops while a dive goes on."""
+"""Marks and way-points that a person drops while a dive goes on.
+
+What a person says to a dive that goes on. Commands come through the feed, between messages of the sources.
+"""
 
 import csv
 import math
@@ -8,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
-from rovgraph.trajectory import Trajectory
 
 MARKS = "marks.csv"
 MOST_MARKS = 500  # that pages may drop: the whole file is written at each
@@ -151,3 +154,45 @@ def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
             except (ValueError, TypeError, KeyError):
                 warnings.complain(str(path), "marks", "a line that is no mark is left out")
     return tuple(marks)
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something that a person wants done."""
+
+
+@dataclass(frozen=True)
+class DropMark(Command):
+    """Keep a place.
+
+    Attributes
+    ----------
+    name : any text
+    north, east : of a way-point [m]; None = a mark where the vehicle is
+    """
+
+    name: str
+    north: float | None = None
+    east: float | None = None
+
+
+@dataclass(frozen=True)
+class RemoveMark(Command):
+    """Forget a mark by its number."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class SetPosition(Command):
+    """Where the vehicle is now: becomes a position fix, which is weighed and gated as any other.
+
+    Attributes
+    ----------
+    north, east : [m]
+    sd : of each [m]
+    """
+
+    north: float
+    east: float
+    sd: float

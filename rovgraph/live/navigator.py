@@ -13,30 +13,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rovgraph.calibration import LAYOUT, TABLE
-from rovgraph.config import Config
-from rovgraph.engine.assembly import InsertResult
-from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.geometry import Array
+from rovgraph.inference.filter_step import Gaussian
+from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.crosscheck import Crosscheck
-from rovgraph.live.faults import Faults
-from rovgraph.live.health import Health
-from rovgraph.live.incoherence import Incoherence
-from rovgraph.live.intake import Intake
-from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
+from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
+from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
 from rovgraph.live.solution import Event, Solution
-from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
+from rovgraph.model.calibration import LAYOUT, TABLE
+from rovgraph.model.config import Config
+from rovgraph.problem.assembly import InsertResult
+from rovgraph.problem.initial_conditions import InitialConditions, restored
 
 if TYPE_CHECKING:
-    from rovgraph.estimators.incremental import IncrementalEstimator
+    from rovgraph.inference.graph.isam2 import IncrementalEstimator
 
 ALTITUDE_S = 3.0  # longest age of an altitude
 TICK_S = 0.1  # between looks for sensors that have fallen silent
@@ -299,7 +294,7 @@ class Navigator:
         """The first seconds are over, or an estimate goes on from its state."""
         config = initial.config
         if self.smooth:
-            from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
+            from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
             self.isam2 = IncrementalEstimator(initial, UPDATE_S)
         whole = self.smooth or self._reinitialisations is not None

@@ -13,24 +13,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.diagnosis import Statistic, find_alarms
-from rovgraph.diagnosis.constants import earth_rate_of, held_in
+from rovgraph.diagnosis.constants import contradicted_constants_in, earth_rate_of
 from rovgraph.diagnosis.unstated_noise import unstated
-from rovgraph.engine.chain_layout import COLUMNS
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, states_of
-from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.problem import Problem
-from rovgraph.engine.released import as_chain
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
-from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.geometry import Array
+from rovgraph.inference.chain import COLUMNS
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.error_state import REINITIALISE_AT_S, reinitialised
+from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter_step import Gaussian, states_of
+from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
+from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.score_test import as_chain
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.model.state import BIAS, VELOCITY
+from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.problem import Problem
 from rovgraph.rules import RULES
-from rovgraph.state import BIAS, VELOCITY
-from rovgraph.trajectory import Trajectory
 
 Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
 _Smoothed = tuple[Gaussian, list[Statistic]]
@@ -189,7 +188,7 @@ def _shown(
     noise: list[Statistic] = []
     # what the dive does not determine shows nothing either, and an examination that fails is no reason to stop
     with suppress(InputError, np.linalg.LinAlgError):
-        held += held_in(as_chain(best, initial), config, v_sd, begin, end)
+        held += contradicted_constants_in(as_chain(best, initial), config, v_sd, begin, end)
     with suppress(InputError, np.linalg.LinAlgError):
         if end - begin > SEARCHED_UNTIL_S:
             noise += [one for one in before if one.kind == "unstated"]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.streams import Stream
-from rovgraph.tables import Table, read_table, table_beside, table_of_arrays
+from rovgraph.log.tables import Table, read_table, table_beside, table_of_arrays
 
 BEAMS = "dvl_beams"  # name of the table
 MOST_BEAMS = 8

@@ -19,10 +19,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate, wrap_angle
 from rovgraph.log.log import Log
 from rovgraph.log.streams import Stream, integral
+from rovgraph.model.config import Config, mount_matrix
 
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ROUNDING = 1e-9  # relative, of numbers that are converted
@@ -92,7 +92,7 @@ HOLDS: Mapping[str, Hold] = {
 }
 
 
-class Run(NamedTuple):
+class EqualRun(NamedTuple):
     """Equal measurements of a sensor, shape (k,), and the times of the first and last of them [s]."""
 
     values: Array
@@ -100,7 +100,7 @@ class Run(NamedTuple):
     last: float
 
 
-Shown = Callable[[Run], str]  # what shows that the vehicle moved meanwhile; "" = nothing does
+Shown = Callable[[EqualRun], str]  # what shows that the vehicle moved meanwhile; "" = nothing does
 
 
 @dataclass(frozen=True)
@@ -493,7 +493,7 @@ def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | Non
     if not long.any() or (shown := _motion_shown(sensor, runs, long, log, config, turning)) is None:
         return
     for k in np.flatnonzero(long).tolist():
-        if why := shown(Run(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
+        if why := shown(EqualRun(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
             yield k, why
 
 
@@ -521,7 +521,7 @@ def _motion_shown(
 def _speed_by_dvl(pings: Stream) -> Shown:
     """That the DVL moves: all that a log without an IMU shows."""
 
-    def shown(run: Run) -> str:
+    def shown(run: EqualRun) -> str:
         speeds = np.linalg.norm(_during(pings, run.first, run.last)[:, :3], axis=1)
         speed = float(np.median(speeds[np.isfinite(speeds)])) if np.isfinite(speeds).any() else 0.0
         return f"it moves at {speed:.2f} m/s without any noise" if speed > CLEAR_SPEED else ""
@@ -532,7 +532,7 @@ def _speed_by_dvl(pings: Stream) -> Shown:
 def _way_by_dvl(pings: Stream, config: Config) -> Shown:
     """That the DVL goes further than fixes are off."""
 
-    def shown(run: Run) -> str:
+    def shown(run: EqualRun) -> str:
         during = _during(pings, run.first, run.last)[:, :3]
         way = (run.last - run.first) * (float(np.median(np.linalg.norm(during, axis=1))) if len(during) else 0.0)
         return f"the DVL moves by {way:.0f} m" if way > max(FIX_DISTANCE, SURE * config.fix.sd_m) else ""
@@ -547,7 +547,7 @@ def _turn_by_gyro(log: Log, config: Config, turning: float | None) -> Shown:
     rate = rate - (np.median(rate) if turning is None else turning)
     turned = integral(imu.time, rate)
 
-    def shown(run: Run) -> str:
+    def shown(run: EqualRun) -> str:
         during = turned[_slice(imu, run.first, run.last)]
         turn = float(np.ptp(during)) if len(during) else 0.0
         least = max(TURNED, TURN_DRIFT * (run.last - run.first))
@@ -565,7 +565,7 @@ def _dive_by_dvl(pings: Stream, imu: Stream, config: Config, runs: Runs) -> Show
     resolution = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
     least = max(DIVED, 10.0 * config.depth.sd_m, 2.0 * resolution)
 
-    def shown(run: Run) -> str:
+    def shown(run: EqualRun) -> str:
         during = _slice(pings, run.first, run.last)
         if during.stop - during.start < 2:
             return ""
@@ -604,7 +604,7 @@ def downwards(imu: Stream, config: Config, time: Array) -> Array:
     return np.asarray(-force / np.maximum(np.linalg.norm(force, axis=1), 1e-9)[:, None])
 
 
-def _alive(log: Log, run: Run) -> str:
+def _alive(log: Log, run: EqualRun) -> str:
     """That the IMU's signals change, as those of a real one always do, beside values that are not zero."""
     samples = _between(log, "imu", run.first, run.last)
     alive = len(samples) > 2 and np.ptp(samples, axis=0).max() > ALIVE

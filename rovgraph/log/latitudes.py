@@ -2,7 +2,8 @@
 
 A receiver without a fix writes a number that no position has. Degrees and minutes in one number (4330.5 = 43 deg 30.5
 min), 1e-7 degrees, and exchanged columns are beyond the range of degrees in every row, and within it once put right.
-What stays within the range (radians, exchanged columns near the equator) shows against the DVL (`check.fixes`).
+What stays within the range (radians, exchanged columns near the equator) shows against the DVL
+(`diagnosis.check.fixes`).
 """
 
 import re

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings, warn
 from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams
 from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
-from rovgraph.tables import Table, read_table, table_of_arrays, table_of_frame
+from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame
+from rovgraph.model.config import Config, config_or_defaults
 
 
 @dataclass(frozen=True, repr=False)

@@ -10,10 +10,10 @@ import numpy as np
 import pymap3d
 from numpy.typing import NDArray
 
-from rovgraph.config import Config, TableSettings
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.latitudes import valid_positions
+from rovgraph.log.stamps import STEP_BACK, mend, require_moving
 from rovgraph.log.streams import (
     DATE,
     LABEL,
@@ -28,6 +28,7 @@ from rovgraph.log.streams import (
     is_optional,
     label_number,
 )
+from rovgraph.log.tables import Table
 from rovgraph.log.units import (
     UNITS,
     known_unit,
@@ -38,9 +39,8 @@ from rovgraph.log.units import (
     scales,
     turn_angles,
 )
+from rovgraph.model.config import Config, TableSettings
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
-from rovgraph.stamps import STEP_BACK, mend, require_moving
-from rovgraph.tables import Table
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]

@@ -9,9 +9,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.log.disk_columns import release
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, all_columns
-from rovgraph.spilling import release
-from rovgraph.tables import Table
+from rovgraph.log.tables import Table
 
 STAMP_DIGITS = 6  # of a second, as a log is written
 

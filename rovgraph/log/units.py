@@ -3,9 +3,12 @@
 A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
 (``gyr: deg/s``); everything becomes SI and radians. A minus before the unit turns the sign (``depth: -m``). How an
 attitude counts is declared in the same way (``ahrs: enu``).
+
+Units as a person reads them: degrees instead of radians.
 """
 
 import difflib
+import math
 import re
 from collections.abc import Container, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass
@@ -213,3 +216,23 @@ def near_miss(name: str, present: Container[str]) -> str | None:
     """
     near = difflib.get_close_matches(name.strip().lower(), all_columns(), 1, cutoff=0.79)
     return near[0] if near and near[0] not in present else None
+
+
+def shown(unit: str) -> tuple[float, str]:
+    """Factor from a unit inside the program to the one shown, and that one's name.
+
+    >>> shown("m")
+    (1.0, 'm')
+    """
+    if unit.startswith("rad"):
+        return math.degrees(1.0), "deg" + unit[3:]
+    return 1.0, unit
+
+
+def behind(unit: str) -> str:
+    """A unit that is shown, as it stands behind a number; nothing of a ratio.
+
+    >>> behind("deg"), behind("1")
+    (' deg', '')
+    """
+    return "" if unit in ("", "1") else f" {unit}"

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.calibrate import MagnetometerCalibration, NoiseReport
-from rovgraph.calibrate.piece import Piece, piece_yaml, with_piece
-from rovgraph.config import Config
-from rovgraph.report.figure_magnetometer import draw_magnetometer
-from rovgraph.report.figure_noise import draw_allan, draw_spectra
+from rovgraph.lab.calibrate import MagnetometerCalibration, NoiseReport
+from rovgraph.lab.calibrate.piece import Piece, piece_yaml, with_piece
+from rovgraph.model.config import Config
+from rovgraph.report.figures_calibrate import draw_allan, draw_magnetometer, draw_spectra
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
 from rovgraph.report.style import save, style

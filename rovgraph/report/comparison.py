@@ -10,11 +10,10 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.lab.compare import Comparison
+from rovgraph.report.folder import STAMP, SUMMARY, versions
 from rovgraph.report.results import to_plain
 from rovgraph.report.units import plus_minus
-from rovgraph.report.versions import versions
-from rovgraph.studies.compare import Comparison
 
 DIGITS = "%.7g"
 MARKS = {"above": "↑", "below": "↓", "within": " "}  # of a mean NEES against its band
@@ -26,7 +25,7 @@ def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, A
     Parameters
     ----------
     folder : an existing folder, such as `results_folder` yields
-    comparison : of `rovgraph.studies.compare.compare`
+    comparison : of `rovgraph.lab.compare.compare`
     about : what it was made of and how long it took, for summary.json
     """
     tables = {
@@ -53,11 +52,11 @@ def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, A
 
 
 def comparison_table(comparison: Comparison, title: str, thesis: bool) -> Table:
-    """A row per estimator, 120 columns wide; `rovgraph.report.narrow` fits it into fewer.
+    """A row per estimator, 120 columns wide; `rovgraph.report.tables` fits it into fewer.
 
     Parameters
     ----------
-    comparison : of `rovgraph.studies.compare.compare`
+    comparison : of `rovgraph.lab.compare.compare`
     title : what was compared on what
     thesis : show the thesis's end errors beside ours
     """

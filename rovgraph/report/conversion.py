@@ -14,14 +14,14 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from rovgraph.config import AS_WRITTEN, Config
 from rovgraph.errors import InputError
-from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
-from rovgraph.interchange.guessing.groups import ColumnGuess
+from rovgraph.log.csv_writer import write_csv, write_sparse_csv
 from rovgraph.log.rows import Part, column_names, frame_of, pieces, whole
-from rovgraph.progress import Progress, no_progress
-from rovgraph.tables import SUFFIXES
+from rovgraph.log.tables import SUFFIXES
+from rovgraph.model.config import AS_WRITTEN, Config
+from rovgraph.process import Progress, no_progress
+from rovgraph.readers.guessing.groups import ColumnGuess
 
 PIECE = 8192  # rows of a sensor that are written at a time
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
@@ -47,7 +47,7 @@ def write_parts(parts: Sequence[Part], path: Path, progress: Progress = no_progr
 
     Parameters
     ----------
-    parts : of `rovgraph.interchange.merging.Merged`
+    parts : of `rovgraph.readers.merging.Merged`
     progress : called with the current task and how much of it is done
 
     Raises

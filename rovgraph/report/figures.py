@@ -1,21 +1,576 @@
 """The figures of a results folder.
 
 Drawn with matplotlib's objects on an Agg canvas: no display, no global state of pyplot.
+
+Biases and calibration variables against time, with their priors.
+
+Velocity, attitude and depth against time.
+
+Normalised innovations of every sensor: do the measurements fit as well as believed?
+
+The track seen from above, north up, with confidence ellipses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from rovgraph.config import Config
-from rovgraph.estimators.estimate import Estimate
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
+from rovgraph.inference.estimate import CalibrationEstimate, Estimate
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
-from rovgraph.report.figure_calibration import draw_calibration
-from rovgraph.report.figure_motion import draw_attitude, draw_depth, draw_velocity
-from rovgraph.report.figure_residuals import draw_residuals
-from rovgraph.report.figure_track import draw_track
-from rovgraph.report.results import main_first
-from rovgraph.report.style import save, style
-from rovgraph.trajectory import Trajectory
+from rovgraph.log.units import shown
+from rovgraph.model.config import Config, beliefs, mount_matrix
+from rovgraph.report.colours import PRIOR, REJECTED, UNUSED, USED
+from rovgraph.report.results import CHI2_99, ellipse_axes, history_labels, main_first
+from rovgraph.report.style import (
+    WIDTH,
+    TimeAxis,
+    broken,
+    legend_below,
+    line_of,
+    name_lowest,
+    name_of,
+    new_figure,
+    panel_grid,
+    save,
+    style,
+    thin,
+)
+from rovgraph.report.units import nice_step, plus_minus
+
+COLUMNS = 3
+SETTLED = 0.25  # of the dive; what is before it may leave the panel
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """One scalar component of one estimate's history, in the unit shown."""
+
+    kind: str
+    time: Array
+    value: Array
+    sd: Array
+
+
+def draw_calibration(estimates: Sequence[Estimate]) -> Figure | None:
+    """A panel per scalar component; None where nothing was estimated."""
+    panels = _gather(estimates)
+    if not panels:
+        return None
+    columns = min(COLUMNS, len(panels))
+    figure = new_figure(1.0 + 1.75 * -(-len(panels) // columns))
+    grid = panel_grid(figure, len(panels), columns)
+    clock = TimeAxis.of(estimates[0])
+    entries = {c.label: c for c in estimates[0].calibration}
+    for axes, (label, (unit, curves)) in zip(grid, panels.items(), strict=True):
+        _calibration_panel(axes, curves, clock, _prior(entries.get(label)))
+        axes.set_title(
+            f"{label.replace('_', ' ')}\n{_last(curves, unit)}", loc="left", pad=4, linespacing=1.25, fontsize=8.5
+        )
+        axes.set_ylabel(f"[{unit}]")
+    name_lowest(grid, columns, clock)
+    thin_lines = f", thin lines ±2 sd of {name_of(estimates[0].kind)}" if len(estimates) > 1 else ""
+    figure.suptitle(f"calibration: bands ±1 and ±2 sd{thin_lines}", x=0.01, ha="left", fontsize=9)
+    legend_below(figure, grid)
+    return figure
+
+
+def _gather(estimates: Sequence[Estimate]) -> dict[str, tuple[str, list[_Curve]]]:
+    """Label -> unit shown and the curves of all estimates."""
+    panels: dict[str, tuple[str, list[_Curve]]] = {}
+    for estimate in estimates:
+        for variable, history in estimate.history.items():
+            factor, unit = shown(history.unit)
+            unit = unit.replace("s2", "s²")
+            some = thin(len(history.time))
+            for i, label in enumerate(history_labels(variable, history)):
+                value, sd = factor * history.value[some, i], factor * history.sd[some, i]
+                curve = _Curve(estimate.kind, history.time[some], value, sd)
+                panels.setdefault(label, (unit, []))[1].append(curve)
+    return panels
+
+
+def _prior(entry: CalibrationEstimate | None) -> tuple[float, float] | None:
+    """Mean and sd of a prior in the unit shown."""
+    if entry is None:
+        return None
+    factor = shown(entry.unit)[0]
+    return factor * entry.prior_mean, factor * entry.prior_sd
+
+
+def _last(curves: list[_Curve], unit: str) -> str:
+    """The value at the end of the leading estimate."""
+    return plus_minus(float(curves[0].value[-1]), float(curves[0].sd[-1]), unit)
+
+
+def _calibration_panel(axes: Axes, curves: list[_Curve], clock: TimeAxis, prior: tuple[float, float] | None) -> None:
+    limits = _calibration_limits(curves, clock)
+    if prior is not None and prior[1] > 0:
+        axes.axhspan(
+            prior[0] - 2 * prior[1], prior[0] + 2 * prior[1], color=PRIOR, lw=0, zorder=0.5, label="prior ±2 sd"
+        )
+    for curve in curves:
+        _draw_curve(axes, curve, clock(curve.time), shaded=curve is curves[-1])
+    axes.set_ylim(*limits)
+    axes.locator_params(axis="y", nbins=4)
+
+
+def _draw_curve(axes: Axes, curve: _Curve, time: Array, shaded: bool) -> None:
+    """A line with its bands, shaded or, where another one's are, as thin lines at ±2 sd."""
+    look = line_of(curve.kind)
+    axes.plot(time, curve.value, label=name_of(curve.kind), **look)
+    for width, alpha in ((2, 0.16), (1, 0.22)):
+        low, high = curve.value - width * curve.sd, curve.value + width * curve.sd
+        if shaded:
+            axes.fill_between(time, low, high, color=look["color"], alpha=alpha, lw=0, zorder=look["zorder"] - 2)
+        elif width == 2:
+            axes.plot(time, np.stack([low, high], axis=-1), color=look["color"], lw=0.6, zorder=look["zorder"])
+
+
+def _calibration_limits(curves: list[_Curve], clock: TimeAxis) -> tuple[float, float]:
+    """Limits that hold every curve, and its ±2 sd once it has settled."""
+    ends = np.concatenate(list(_extremes(curves, clock.start + SETTLED * (clock.end - clock.start))))
+    ends = ends[np.isfinite(ends)]
+    if not len(ends):
+        return -1.0, 1.0
+    low, high = float(ends.min()), float(ends.max())
+    margin = 0.25 * (high - low) or max(1e-3 * abs(high), 1e-6)
+    return low - margin, high + margin
+
+
+def _extremes(curves: list[_Curve], settled: float) -> Iterator[Array]:
+    for curve in curves:
+        late = curve.time >= settled
+        yield curve.value[late] - 2 * curve.sd[late]
+        yield curve.value[late] + 2 * curve.sd[late]
+
+
+SOURCES: dict[str, tuple[str, dict[str, Any]]] = {
+    "ahrs": ("AHRS heading", {"marker": ".", "color": "#999999"}),
+    "dvl_heading": ("DVL compass", {"marker": "x", "color": "#009E73", "mew": 0.5}),
+    "mag": ("magnetometer", {"marker": "+", "color": "#E69F00", "mew": 0.5}),
+}
+BOTTOM: dict[str, Any] = {"color": "#8C6D46", "linewidth": 0.9, "zorder": 1}
+MOST_SAMPLES = 1500  # of a heading source
+DENSE = 2000  # epochs from which lines are drawn thinner
+USUAL = (1.0, 99.0)  # percentiles of value ± 2 sd that an axis shows; a poorly known start would flatten the dive
+
+
+def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
+    """Velocity north, east, down and speed over ground, with ±2 sd."""
+    figure = new_figure(7.2)
+    panels: list[Axes] = list(figure.subplots(4, 1, sharex=True))
+    clock = TimeAxis.of(estimates[0])
+    spans: list[list[tuple[float, float]]] = [[] for _ in panels]
+    for estimate in estimates:
+        track = estimate.trajectory
+        speed, speed_sd = _speed(track)
+        values, sds = np.column_stack([track.v_n, speed]), np.column_stack([track.v_sd, speed_sd])
+        some = thin(len(track))
+        for axes, span, value, sd in zip(panels, spans, values[some].T, sds[some].T, strict=True):
+            _line_and_band(axes, clock(track.time[some]), value, sd, estimate.kind)
+            span.append(_span(value, sd))
+    for axes, name, span in zip(panels, ("north", "east", "down", "speed"), spans, strict=True):
+        axes.set_ylabel(f"{name} [m/s]")
+        _scale(axes, span)
+    panels[3].set_ylim(bottom=0.0)
+    panels[0].set_title("velocity over ground, bands ±2 sd", loc="left")
+    clock.name_axis(panels[3])
+    figure.align_ylabels()
+    legend_below(figure, panels)
+    return figure
+
+
+def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
+    """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
+    main, clock = estimates[0], TimeAxis.of(estimates[0])
+    bottom = "dvl_altitude" in log
+    figure = new_figure(4.8 if bottom else 3.6)
+    panels: list[Axes] = list(figure.subplots(1 + bottom, 1, sharex=True, squeeze=False)[:, 0])
+    spans = []
+    for estimate in estimates:
+        track, some = estimate.trajectory, thin(len(estimate.trajectory))
+        depth, sd = track.p_n[some, 2], track.p_sd[some, 2]
+        _line_and_band(panels[0], clock(track.time[some]), depth, sd, estimate.kind)
+        spans.append(_span(depth, sd))
+    panels[0].set_ylabel("depth [m]")
+    panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if bottom else ""), loc="left")
+    if bottom:
+        stream = log["dvl_altitude"].take(thin(len(log["dvl_altitude"])))
+        altitude, time = stream["dvl_altitude"], clock(stream.time)
+        below = main.trajectory.at(stream.time).p_n[:, 2] + altitude
+        panels[0].plot(time, below, label="bottom", **BOTTOM)
+        spans.append(_span(below, np.zeros_like(below)))
+        panels[1].plot(time, altitude, **BOTTOM)
+        panels[1].set_ylabel("altitude [m]")
+        panels[1].set_ylim(bottom=0.0)
+    _scale(panels[0], spans)
+    panels[0].invert_yaxis()
+    clock.name_axis(panels[-1])
+    figure.align_ylabels()
+    legend_below(figure, panels)
+    return figure
+
+
+def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
+    """Roll, pitch and heading with ±2 sd, and what the compasses said."""
+    main, clock = estimates[0], TimeAxis.of(estimates[0])
+    samples = heading_samples(main.trajectory, log, config)
+    heights = (1.0, 1.0, 1.6, 1.1) if samples else (1.0, 1.0, 1.6)
+    figure = new_figure(1.0 + 1.6 * sum(heights))
+    panels: list[Axes] = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
+    low = _lower_end(main.trajectory)
+    for estimate in estimates:
+        _draw_attitude(panels, estimate, clock, low)
+    tracks = [estimate.trajectory for estimate in estimates]
+    for i in (0, 1):
+        _scale(panels[i], [_span(np.rad2deg(t.rpy[:, i]), np.rad2deg(t.rpy_sd[:, i])) for t in tracks])
+    for sensor, (time, heading) in samples.items():
+        label, look = SOURCES[sensor]
+        panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
+        difference = np.rad2deg(wrap_angle(heading - main.trajectory.at(time).rpy[:, 2]))
+        panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
+    names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
+    for axes, name in zip(panels, names, strict=False):
+        axes.set_ylabel(f"{name} [deg]")
+    _limit_heading(panels[2], low)
+    title = "attitude, bands ±2 sd" + ("; compasses before their calibration" if samples else "")
+    panels[0].set_title(title, loc="left")
+    clock.name_axis(panels[-1])
+    figure.align_ylabels()
+    legend_below(figure, panels, 5, 2.0)
+    return figure
+
+
+def _draw_attitude(panels: Sequence[Axes], estimate: Estimate, clock: TimeAxis, low: float) -> None:
+    track, some = estimate.trajectory, thin(len(estimate.trajectory))
+    time, rpy, sd = clock(track.time[some]), track.rpy[some], np.rad2deg(track.rpy_sd[some])
+    for i in (0, 1):
+        _line_and_band(panels[i], time, np.rad2deg(rpy[:, i]), sd[:, i], estimate.kind)
+    time, heading, spread = broken(time, _within(rpy[:, 2], low), sd[:, 2])
+    _line_and_band(panels[2], time, heading, spread, estimate.kind)
+
+
+def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tuple[Array, Array]]:
+    """True heading of the body as each compass has it, before any deviation is taken off.
+
+    Instruments are taken as level: their mounting turns the heading by the azimuth of
+    their x axis. The magnetometer is levelled with the estimate's roll and pitch.
+
+    Returns
+    -------
+    sensor -> (time [s], heading [rad]), each ndarray, shape (m,)
+    """
+    prior = beliefs(config)
+    R_dvl = matrix_from_rpy([float(prior[f"dvl_{angle}"].mean[0]) for angle in ("roll", "pitch", "yaw")])
+    R_imu = mount_matrix(config.imu.mount_rpy_deg)
+    declination = np.deg2rad(config.environment.declination_deg)
+    out = {}
+    for sensor, column, R_bs in (("ahrs", "ahrs_yaw", R_imu), ("dvl_heading", "dvl_heading", R_dvl)):
+        if sensor in log:
+            some = thin(len(log[sensor]), MOST_SAMPLES)
+            azimuth = np.arctan2(R_bs[1, 0], R_bs[0, 0])
+            out[sensor] = (log[sensor].time[some], log[sensor][column][some] + declination - azimuth)
+    if "mag" in log:
+        some = thin(len(log["mag"]), MOST_SAMPLES)
+        time = log["mag"].time[some]
+        out["mag"] = (time, _levelled(track.at(time), rotate(R_imu, log["mag"].data[some])) + declination)
+    return out
+
+
+def _levelled(track: Trajectory, field_b: Array) -> Array:
+    """Magnetic heading from a field in body axes at the attitudes of a track [rad]."""
+    rpy = track.rpy
+    level = rotate(matrix_from_rpy(np.column_stack([rpy[:, :2], np.zeros(len(rpy))])), field_b)
+    return np.arctan2(-level[:, 1], level[:, 0])
+
+
+def _speed(track: Trajectory) -> tuple[Array, Array]:
+    """Horizontal speed and its sd [m/s]."""
+    v = track.v_n[:, :2]
+    speed = np.linalg.norm(v, axis=1)
+    along = v / np.maximum(speed, 1e-6)[:, None]
+    variance = np.einsum("ni,nij,nj->n", along, track.cov_v[:, :2, :2], along)
+    return speed, np.sqrt(np.clip(variance, 0.0, None))
+
+
+def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) -> None:
+    look = line_of(kind)
+    if len(time) > DENSE:
+        look = {**look, "linewidth": 0.65 * look["linewidth"]}
+    axes.plot(time, value, label=name_of(kind), **look)
+    if np.isfinite(sd).any():
+        band = {"color": look["color"], "alpha": 0.18, "linewidth": 0, "zorder": look["zorder"] - 2}
+        axes.fill_between(time, value - 2 * sd, value + 2 * sd, **band)
+
+
+def _span(value: Array, sd: Array) -> tuple[float, float]:
+    """What an axis has to show of a line and its ±2 sd."""
+    spread = np.where(np.isfinite(sd), 2.0 * sd, 0.0)
+    known = np.isfinite(value)
+    if not known.any():
+        return np.inf, -np.inf
+    ends = np.percentile((value - spread)[known], USUAL[0]), np.percentile((value + spread)[known], USUAL[1])
+    return float(min(*ends, value[known].min())), float(max(*ends, value[known].max()))
+
+
+def _scale(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
+    """Have an axis show all of some spans, and little more."""
+    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
+    if high >= low:
+        margin = max(0.05 * (high - low), 1e-3)
+        axes.set_ylim(low - margin, high + margin)
+
+
+def _lower_end(track: Trajectory) -> float:
+    """Lower end of the heading axis [deg], 0 or -180, whichever breaks the line less often."""
+    jumps = {low: np.sum(np.abs(np.diff(_within(track.rpy[:, 2], low))) > 180.0) for low in (0.0, -180.0)}
+    return min(jumps, key=lambda low: jumps[low])
+
+
+def _within(heading: Array, low: float) -> Array:
+    """Heading [rad] in degrees from ``low`` to ``low + 360``."""
+    degrees: Array = (np.rad2deg(heading) - low) % 360.0 + low
+    return degrees
+
+
+def _limit_heading(axes: Axes, low: float) -> None:
+    """No axis beyond one turn; over most of a turn, all of it with ticks at the quarters."""
+    bottom, top = np.clip(axes.get_ylim(), low, low + 360.0)
+    if top - bottom > 220.0:
+        bottom, top = low, low + 360.0
+        axes.set_yticks(np.arange(low, low + 361.0, 90.0))
+    axes.set_ylim(bottom, top)
+
+
+LIMIT = 6.0  # [sd]; what lies beyond is drawn at the edge
+
+
+def draw_residuals(estimate: Estimate) -> Figure | None:
+    """A panel per sensor and component; None where there are no residuals."""
+    groups = list(estimate.residuals.groupby(["sensor", "component"], sort=False))
+    if not groups:
+        return None
+    columns = 1 if len(groups) <= 3 else 2
+    figure = new_figure(1.1 + 1.45 * -(-len(groups) // columns))
+    panels = panel_grid(figure, len(groups), columns)
+    clock = TimeAxis.of(estimate)
+    for axes, (key, rows) in zip(panels, groups, strict=True):
+        sensor, component = key
+        _panel(axes, rows, clock, _title(str(sensor), str(component)))
+    name_lowest(panels, columns, clock)
+    figure.suptitle(
+        f"normalised innovations, {name_of(estimate.kind)}; triangles lie beyond ±{LIMIT:g}",
+        x=0.01,
+        ha="left",
+        fontsize=9,
+    )
+    figure.supylabel("innovation / sd [1]", fontsize=9)
+    legend_below(figure, panels, scale=1.8)
+    return figure
+
+
+def _title(sensor: str, component: str) -> str:
+    name = component if component.startswith(sensor) else f"{sensor} {component}"
+    return name.replace("_", " ").replace("heading heading", "heading")
+
+
+def _panel(axes: Axes, rows: pd.DataFrame, clock: TimeAxis, title: str) -> None:
+    time = clock(rows["time"].to_numpy(float))
+    value, weight = rows["normalised"].to_numpy(float), rows["weight"].to_numpy(float)
+    kept = (weight > 0) & np.isfinite(value)
+    axes.axhline(0.0, color="#666666", lw=0.6, zorder=1)
+    for bound in (-3.0, 3.0):
+        axes.axhline(bound, color="black", lw=0.8, ls=(0, (5, 3)), zorder=3)
+    some = np.flatnonzero(kept)
+    some = some[thin(len(some))]
+    _points(
+        axes,
+        time[some],
+        value[some],
+        "used",
+        {"color": line_of("smoothed")["color"], "marker": ".", "ms": 2.0, "alpha": 0.6},
+    )
+    gone = np.flatnonzero(~kept & np.isfinite(value))
+    gone = gone[thin(len(gone))]
+    if len(gone):
+        _points(axes, time[gone], value[gone], "rejected", {"color": REJECTED, "marker": "x", "ms": 4, "mew": 0.8})
+    mean_square = f"{np.mean(value[kept] ** 2):.2f}" if kept.any() else "unknown"
+    rejected = f", {np.sum(~kept)} rejected" if not kept.all() else ""
+    axes.set_title(f"{title}: mean square {mean_square}{rejected}", loc="left", pad=5)
+    axes.set_ylim(-LIMIT - 0.4, LIMIT + 0.4)
+    axes.set_yticks([-6, -3, 0, 3, 6])
+
+
+def _points(axes: Axes, time: Array, value: Array, label: str, look: dict[str, Any]) -> None:
+    """Points inside the panel, and triangles at the edge for those beyond."""
+    inside = np.abs(value) <= LIMIT
+    axes.plot(time[inside], value[inside], ls="none", zorder=2, label=label, **look)
+    for side, marker in ((1.0, "^"), (-1.0, "v")):
+        beyond = time[value * side > LIMIT]
+        if len(beyond):
+            edge = np.full(len(beyond), side * LIMIT)
+            axes.plot(beyond, edge, ls="none", marker=marker, ms=3.2, mew=0, color=look["color"], zorder=4)
+
+
+ELLIPSES = 20  # along a track, at most
+FIXES = 150  # of a kind that are drawn, at most
+_HALO = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "boxstyle": "square,pad=0.1"}
+
+
+def draw_track(estimates: Sequence[Estimate], log: Log, config: Config, reference: Trajectory | None = None) -> Figure:
+    """North over east in metres, equal scales.
+
+    Parameters
+    ----------
+    estimates : the leading one first; it carries the ellipses
+    log : its fixes are drawn, if it has any
+    config : names the figure
+    reference : a known trajectory, or None
+    """
+    main = estimates[0]
+    limits = _limits([e.trajectory for e in estimates] + ([reference] if reference is not None else []))
+    figure = new_figure(*_size(limits))
+    axes = figure.add_subplot()
+    for estimate in estimates:
+        _draw_line(axes, estimate.trajectory, estimate.kind, name_of(estimate.kind))
+    if reference is not None:
+        _draw_line(axes, reference, "reference", "reference")
+    step = nice_step((main.trajectory.time[-1] - main.trajectory.time[0]) / ELLIPSES)
+    _draw_ellipses(axes, main.trajectory, _at_times(main.trajectory, step), main.kind, f"99 % every {_spoken(step)}")
+    for estimate in estimates[1:]:
+        _draw_ellipses(
+            axes, estimate.trajectory, np.array([len(estimate.trajectory) - 1]), estimate.kind, "99 % at the end"
+        )
+    outside = _draw_fixes(axes, main, log, limits)
+    _draw_ends(axes, main)
+    _name_axes(axes, limits, config.name, outside)
+    legend_below(figure, [axes], 3)
+    return figure
+
+
+def _limits(tracks: Sequence[Trajectory]) -> Array:
+    """What must be seen, [[east low, high], [north low, high]], with a margin [m].
+
+    All tracks, the ellipses of the first one and the last ellipse of the others.
+    """
+    corners = [track.p_n[:, [1, 0]] for track in tracks]
+    for i, track in enumerate(tracks):
+        part = slice(None) if i == 0 else slice(-1, None)
+        variance = np.diagonal(track.cov_p[part, :2, :2], axis1=1, axis2=2)[:, ::-1]
+        reach = np.sqrt(CHI2_99 * np.nan_to_num(variance))
+        corners += [corners[i][part] - reach, corners[i][part] + reach]
+    everything = np.concatenate(corners)
+    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
+    margin = 0.05 * max(float(np.max(high - low)), 1.0)
+    return np.stack([low - margin, high + margin], axis=-1)
+
+
+def _size(limits: Array) -> tuple[float, float]:
+    """Height and width [in] of a figure whose axes hold the limits at equal scales."""
+    east, north = limits[:, 1] - limits[:, 0]
+    ratio = float(np.clip(north / east, 0.3, 1.35))
+    return 1.5 + (WIDTH - 0.8) * ratio, WIDTH
+
+
+def _spoken(step: float) -> str:
+    return f"{step / 60:g} min" if step >= 60 else f"{step:g} s"
+
+
+def _at_times(track: Trajectory, step: float) -> Array:
+    """Indices of the epochs nearest to every multiple of a step, and the last one."""
+    times = np.append(np.arange(track.time[0], track.time[-1], step), track.time[-1])
+    return np.unique(np.clip(np.searchsorted(track.time, times), 0, len(track) - 1))
+
+
+def _draw_line(axes: Axes, track: Trajectory, kind: str, label: str) -> None:
+    some = thin(len(track))
+    axes.plot(track.p_n[some, 1], track.p_n[some, 0], label=label, **line_of(kind))
+
+
+def _draw_ellipses(axes: Axes, track: Trajectory, index: Array, kind: str, label: str) -> None:
+    index = index[np.isfinite(track.cov_p[index, :2, :2]).all(axis=(1, 2))]
+    if not len(index):
+        return
+    major, minor, bearing = ellipse_axes(track.cov_p[index])
+    look = line_of(kind)
+    face = look["color"] + "18" if len(index) > 1 else "none"
+    ellipses = EllipseCollection(
+        2 * major,
+        2 * minor,
+        90.0 - np.rad2deg(bearing),  # from east, counter-clockwise
+        units="xy",
+        offsets=track.p_n[index][:, [1, 0]],
+        offset_transform=axes.transData,
+        edgecolors=look["color"],
+        linewidths=0.7,
+        zorder=2.5,
+        facecolors=face,
+        linestyles=[look["linestyle"]],
+    )
+    axes.add_collection(ellipses)
+    axes.plot(
+        [], [], ls="none", marker="o", ms=8, mfc=face, mec=look["color"], mew=0.7, label=f"{label}, {name_of(kind)}"
+    )
+
+
+def _draw_fixes(axes: Axes, estimate: Estimate, log: Log, limits: Array) -> int:
+    """Fixes used, rejected and not used; the number of those outside the limits."""
+    if "fix" not in log:
+        return 0
+    stream, rows = log["fix"], estimate.residuals
+    weight = rows[rows["sensor"] == "fix"].groupby("row")["weight"].min().reindex(stream.row).to_numpy(float)
+    point = np.stack([stream["fix_east"], stream["fix_north"]], axis=-1)
+    inside = ((point >= limits[:, 0]) & (point <= limits[:, 1])).all(axis=-1)
+    groups: tuple[tuple[NDArray[np.bool_], str, dict[str, Any]], ...] = (
+        (np.isnan(weight), "fix, not used", {"marker": ".", "color": UNUSED, "ms": 3, "zorder": 1}),
+        (weight > 0, "fix, used", {"marker": "+", "color": USED, "ms": 5, "zorder": 1.5}),
+        (weight <= 0, "fix, rejected", {"marker": "x", "color": REJECTED, "ms": 5, "zorder": 1.6}),
+    )
+    for chosen, label, look in groups:
+        some = np.flatnonzero(chosen & inside)
+        if len(some):
+            some = some[thin(len(some), FIXES)]
+            axes.plot(*point[some].T, linestyle="none", mew=0.8, label=label, **look)
+    return int(np.sum(~inside & np.isfinite(point).all(axis=-1)))
+
+
+def _draw_ends(axes: Axes, estimate: Estimate) -> None:
+    north, east = estimate.trajectory.p_n[[0, -1], 0], estimate.trajectory.p_n[[0, -1], 1]
+    look: dict[str, Any] = {"linestyle": "none", "color": "black", "zorder": 6}
+    axes.plot(east[0], north[0], marker="o", ms=6, mfc="white", mew=1.2, label="start", **look)
+    axes.plot(east[1], north[1], marker="s", ms=5.5, mew=1.2, label="end", **look)
+    _draw_minutes(axes, estimate)
+
+
+def _draw_minutes(axes: Axes, estimate: Estimate) -> None:
+    """A few times along the track, so that its direction can be read."""
+    track, clock = estimate.trajectory, TimeAxis.of(estimate)
+    step = nice_step((clock.end - clock.start) / 6)
+    for i in _at_times(track, step)[1:-1]:
+        text = _spoken(float(np.round((track.time[i] - clock.start) / step)) * step)
+        north, east = track.p_n[i, :2]
+        axes.plot(east, north, ".", color="black", ms=5, zorder=6)
+        axes.annotate(text, (east, north), (4, 4), textcoords="offset points", fontsize=8, zorder=7, bbox=_HALO)
+
+
+def _name_axes(axes: Axes, limits: Array, name: str, outside: int) -> None:
+    axes.set_xlim(*limits[0])
+    axes.set_ylim(*limits[1])
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("east [m]")
+    axes.set_ylabel("north [m]")
+    note = f" ({outside} {'fix' if outside == 1 else 'fixes'} outside the figure)" if outside else ""
+    axes.set_title(f"{name}: track{note}", loc="left")
 
 
 def draw_figures(

@@ -2,18 +2,22 @@
 
 It is written under a temporary name beside its final place and renamed at the end, so
 that an error, a full disk or Ctrl-C leaves neither half a result nor a lost old one.
+
+Versions of what a result was computed with.
 """
 
 import contextlib
 import errno
 import json
 import os
+import platform
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from rovgraph import __version__
+from rovgraph._version import __version__
 from rovgraph.errors import InputError, warn
 
 SUMMARY = "summary.json"
@@ -202,3 +206,18 @@ def _one_line(path: Path, inside: Path | None = None) -> Iterator[None]:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "free space or choose another --out" if full else "choose another --out"
         raise InputError(f"{path}: cannot be written ({reason}), nothing was kept; {remedy}") from error
+
+
+LIBRARIES = ("numpy", "scipy", "pandas", "numba", "gtsam")
+
+
+def versions() -> dict[str, str | None]:
+    """Python and library -> version; None where a library is not installed, as GTSAM on Windows."""
+    return {"python": platform.python_version(), **{name: _installed(name) for name in LIBRARIES}}
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

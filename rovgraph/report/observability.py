@@ -10,15 +10,14 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from rovgraph.config import Config
-from rovgraph.estimators.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE
+from rovgraph.inference.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE
+from rovgraph.lab.observability import OTHER_LABELS, Observability, directions, in_words
+from rovgraph.lab.plan import Plan
+from rovgraph.log.units import shown
+from rovgraph.model.config import Config
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
 from rovgraph.report.units import label_with_unit
-from rovgraph.studies.directions import directions, in_words
-from rovgraph.studies.observability import OTHER_LABELS, Observability
-from rovgraph.studies.plan import Plan
-from rovgraph.units import shown
 
 OBSERVABILITY, PLAN = "observability.json", "plan.json"
 TOLD = 12  # correlations in the table's caption
@@ -30,7 +29,7 @@ def write_observability(folder: Path, seen: Observability, config: Config, about
     Parameters
     ----------
     folder : an existing folder, such as `results_folder` yields
-    seen : of `rovgraph.studies.observability.observe`
+    seen : of `rovgraph.lab.observability.observe`
     config : what was believed
     about : what it was made of, for summary.json
     """

@@ -10,10 +10,9 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.lab.misalignment import Study, Tables
+from rovgraph.report.folder import STAMP, SUMMARY, versions
 from rovgraph.report.results import to_plain
-from rovgraph.report.versions import versions
-from rovgraph.studies.misalignment import Study, Tables
 
 SEEDS = "run r of a cell: 15 hexadecimal digits of SHA-256 of [seed, parameters of the dive, r]; column seed"
 MOST_ROWS = 60  # of a table on a terminal
@@ -25,7 +24,7 @@ def write_study(folder: Path, tables: Tables, about: Mapping[str, Any]) -> None:
     Parameters
     ----------
     folder : of the study, with its runs.csv
-    tables : of `rovgraph.studies.misalignment.study`
+    tables : of `rovgraph.lab.misalignment.study`
     about : where and how long it ran
     """
     tables.cells.to_csv(folder / "cells.csv", index=False, float_format="%.7g")

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
+from rovgraph.inference.estimate import Estimate
 from rovgraph.report.colours import ESTIMATES
 from rovgraph.report.colours import OTHER as OTHER_COLOUR
 
@@ -96,7 +96,7 @@ def name_of(kind: str) -> str:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeAxis:
     """Time since the start, in seconds or, for long dives, minutes.
 
     Attributes
@@ -108,9 +108,9 @@ class Clock:
     end: float
 
     @staticmethod
-    def of(estimate: Estimate) -> "Clock":
+    def of(estimate: Estimate) -> "TimeAxis":
         """The clock of an estimate's trajectory."""
-        return Clock(float(estimate.trajectory.time[0]), float(estimate.trajectory.time[-1]))
+        return TimeAxis(float(estimate.trajectory.time[0]), float(estimate.trajectory.time[-1]))
 
     @property
     def minutes(self) -> bool:
@@ -163,7 +163,7 @@ def panel_grid(figure: Figure, count: int, columns: int) -> list[Axes]:
     return panels[:count]
 
 
-def name_lowest(panels: Sequence[Axes], columns: int, clock: Clock) -> None:
+def name_lowest(panels: Sequence[Axes], columns: int, clock: TimeAxis) -> None:
     """Name the time axis under the lowest panel of every column."""
     for axes in panels[-columns:]:
         clock.name_axis(axes)

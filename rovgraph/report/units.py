@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rovgraph.units import behind, shown
+from rovgraph.log.units import behind, shown
 
 
 def plus_minus(value: float, sd: float, unit: str = "") -> str:

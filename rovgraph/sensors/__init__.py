@@ -4,13 +4,12 @@ One module per sensor holds its model and its `Sensor`; `SENSORS` has them all b
 docs/own-sensor.md shows how to `register` one of your own.
 """
 
-from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, CompassHeading
+from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, VEHICLE_TILT, CompassHeading, Tilt
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
 from rovgraph.sensors.inertial import IMU
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
 from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
-from rovgraph.sensors.place import SEEN_PLACE, PlaceOffset
-from rovgraph.sensors.position import DEPTH, FIX, Position
+from rovgraph.sensors.position import DEPTH, FIX, SEEN_PLACE, PlaceOffset, Position
 from rovgraph.sensors.sensor import (
     MOSTLY,
     SENSORS,
@@ -28,7 +27,6 @@ from rovgraph.sensors.sensor import (
     unregister,
 )
 from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
-from rovgraph.sensors.tilt import VEHICLE_TILT, Tilt
 
 __all__ = [
     "DEFAULT_DIP",

@@ -1,18 +1,21 @@
-"""Compasses that give a heading: the IMU's own, the DVL's, and the vehicle's."""
+"""Compasses that give a heading: the IMU's own, the DVL's, and the vehicle's.
+
+The vehicle's own roll and pitch, which stand in for an accelerometer where there is no IMU.
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from rovgraph.calibration import LAYOUT, MOUNT
-from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
+from rovgraph.model.calibration import LAYOUT, MOUNT
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.state import BIAS, POSE, Jacobians, State
 from rovgraph.sensors.dvl import TIME_OFFSET
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instrument
-from rovgraph.state import BIAS, POSE, Jacobians, State
 
 
 @dataclass(frozen=True)
@@ -118,5 +121,36 @@ VEHICLE_HEADING = Sensor(
     observes=Observed("heading", (2,)),
     linear_in="vehicle_compass_offset",
     heading_source="vehicle",
+    may_begin_later=True,
+)
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """Roll and pitch of the body."""
+
+    sensor = "vehicle_tilt"
+    dim = 2
+    angular = True
+    state = (POSE, BIAS)
+    calibration: tuple[str, ...] = ()
+    kind = kernels.TILT
+    packed = np.zeros((1, 0))  # it has no numbers of its own
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE,), state, rate_b)
+
+
+def tilt_of_vehicle(config: Config, origin_b: Array) -> Instrument:
+    """Roll and pitch as the vehicle's own navigation gives them."""
+    return instrument(config.tilt, Tilt(), np.deg2rad(config.tilt.sd_deg), ("roll", "pitch"))
+
+
+VEHICLE_TILT = Sensor(
+    "vehicle_tilt",
+    (Column("roll", "angle", group="attitude"), Column("pitch", "angle", group="attitude")),
+    tilt_of_vehicle,
+    once_per_interval=True,
+    observes=Observed("heading", (0, 1)),
     may_begin_later=True,
 )

@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.calibration import MOUNT
-from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, skew
 from rovgraph.kernels import measurements as kernels
+from rovgraph.model.calibration import MOUNT
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Said, Sensor, instrument
-from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
 TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.state import BIAS, POSE, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Said, Sensor, instrument
-from rovgraph.state import BIAS, POSE, Jacobians, State
 
 # the mean field of the Earth in each unit; "1" where it was normalised
 EARTH_FIELD = {"uT": 45.0, "nT": 45e3, "mG": 450.0, "gauss": 0.45, "T": 45e-6, "1": 1.0}

@@ -17,12 +17,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.kernels import measurements as kernels
 from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.states import States
-from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
+from rovgraph.model.calibration import LAYOUT, calibration_size
+from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 
 class SensorModel(Protocol):

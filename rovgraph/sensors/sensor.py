@@ -12,10 +12,10 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rovgraph import calibration
-from rovgraph.calibration import Variable
-from rovgraph.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.geometry import Array
+from rovgraph.model import calibration
+from rovgraph.model.calibration import Variable
+from rovgraph.model.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.sensors.model import SensorModel
 
 RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that are no sensor's

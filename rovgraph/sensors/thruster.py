@@ -30,14 +30,14 @@ from functools import cached_property
 
 import numpy as np
 
-from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.kernels.measurements import WATER_VELOCITY
+from rovgraph.model.config import Config
+from rovgraph.model.hydrodynamics import Hydrodynamics
+from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Instrument, Observed, Sensor, instrument
-from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
-from rovgraph.vehicle import Hydrodynamics
 
 RISE_SHARE = 0.8
 AT_ONCE_S = 1e-3  # a shorter rise is taken as this long

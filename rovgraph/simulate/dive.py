@@ -2,6 +2,18 @@
 
 Each sensor is sampled at its own epochs by ``model.predict`` with the true state and the
 true calibration; noise and faults come on top. All randomness comes from one generator.
+
+The inertial unit: specific force and angular rate at its own place, in its own axes.
+
+At the lever arm l, with the Earth's rate w_ie where it is modelled,
+
+    f_b = R_bn (a_n + 2 w_ie x v_n - g_n) + alpha x l + w x (w x l) + 2 w_ie x (w x l)
+    y   = R_sb ([f_b, w + R_bn w_ie] + bias) + noise
+
+which is (3.14) with alpha x l kept and the sign of gravity corrected. Biases are in body
+axes, as an estimator states them, and walk from sample to sample.
+
+Errors that last: first-order Gauss-Markov processes (Gelb 1974, 3.8) that belong to calibration variables.
 """
 
 from collections.abc import Mapping
@@ -12,18 +24,120 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.config import mount_matrix
-from rovgraph.geometry import Array, rotate, rpy_from_matrix, transpose, wrap_angle
-from rovgraph.instruments import instruments
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, earth_rate_n, rotate, rpy_from_matrix, transpose, wrap_angle
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
+from rovgraph.model.state import State
 from rovgraph.sensors import SENSORS, field_direction
-from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes, walk, white
-from rovgraph.simulate.lasting import LastingErrors, draw_lasting
-from rovgraph.simulate.magnetism import compass_turn
-from rovgraph.simulate.noise import correlated, remembered
+from rovgraph.sensors.instruments import instruments
+from rovgraph.simulate.environment import compass_turn
 from rovgraph.simulate.path import Motion, Path
-from rovgraph.simulate.truth import Truth
-from rovgraph.state import State
-from rovgraph.trajectory import Trajectory
+from rovgraph.simulate.truth import Truth, correlated, of_waves, remembered
+
+
+def _earth_rate(config: Config) -> Array:
+    """Rate of the Earth in n, shape (3,) [rad/s]; zero where it is not modelled.
+
+    Raises
+    ------
+    InputError : modelled, but the latitude is not known
+    """
+    env = config.environment
+    if not env.earth_rotation:
+        return np.zeros(3)
+    if env.latitude_deg is None:
+        raise InputError("environment.earth_rotation needs environment.latitude_deg")
+    return earth_rate_n(float(np.deg2rad(env.latitude_deg)))
+
+
+def specific_force_and_rate(motion: Motion, config: Config) -> Array:
+    """What a perfect unit senses, in body axes.
+
+    Parameters
+    ----------
+    motion : Motion of n epochs
+    config : Config
+
+    Returns
+    -------
+    ndarray, shape (n, 6), specific force [m/s^2], angular rate [rad/s]
+    """
+    arm = np.asarray(config.imu.lever_arm_m, float)
+    w_ie_n, g_n = _earth_rate(config), np.array([0.0, 0.0, config.environment.gravity_mps2])
+    R_bn = transpose(motion.R_nb)
+    w_ie_b = rotate(R_bn, w_ie_n)
+    swing = np.cross(motion.w_b, arm)
+    f_b = rotate(R_bn, motion.a_n + 2.0 * np.cross(w_ie_n, motion.v_n) - g_n)
+    f_b += np.cross(motion.alpha_b, arm) + np.cross(motion.w_b, swing) + 2.0 * np.cross(w_ie_b, swing)
+    return np.hstack([f_b, motion.w_b + w_ie_b])
+
+
+def walk(start: Array, noise: ImuNoise, rate: float, n: int, rng: np.random.Generator) -> Array:
+    """Bias of n samples, a random walk from ``start``; shape (n, 6)."""
+    sd = np.repeat([noise.acc_walk, noise.gyr_walk], 3) / np.sqrt(rate)
+    steps = sd * rng.standard_normal((n, 6))
+    steps[0] = start
+    return np.cumsum(steps, axis=0)
+
+
+def white(noise: ImuNoise, rate: float, n: int, rng: np.random.Generator) -> Array:
+    """White noise of n samples at ``rate`` [Hz]: density times root rate; shape (n, 6)."""
+    sd = np.repeat([noise.acc, noise.gyr], 3) * np.sqrt(rate)
+    return np.asarray(sd * rng.standard_normal((n, 6)))
+
+
+def to_imu_axes(values_b: Array, config: Config) -> Array:
+    """Body axes to IMU axes, accelerometer and gyro; shape (n, 6)."""
+    R_sb = mount_matrix(config.imu.mount_rpy_deg).T
+    return np.hstack([rotate(R_sb, values_b[:, :3]), rotate(R_sb, values_b[:, 3:])])
+
+
+STEPS = 50  # of a process, in its time constant
+
+
+@dataclass(frozen=True)
+class LastingErrors:
+    """What of the calibration changes with time.
+
+    Attributes
+    ----------
+    series : variable -> time, ndarray, shape (k,) [s], and its values, shape (k, dim), linear in between
+    """
+
+    series: Mapping[str, tuple[Array, Array]]
+
+    def at(self, time: Array) -> dict[str, Array]:
+        """Variable -> ndarray, shape (n, dim), at n epochs [s]."""
+        return {
+            name: np.column_stack([np.interp(time, own, values) for values in every.T])
+            for name, (own, every) in self.series.items()
+        }
+
+
+def draw_lasting(
+    truth: Truth, calibration: Mapping[str, Array], seconds: float, rng: np.random.Generator
+) -> LastingErrors:
+    """A process for each variable that is estimated with a time constant and has no value given.
+
+    Parameters
+    ----------
+    truth : says which
+    calibration : where they begin
+    seconds : how long they go on [s]
+    rng : the same seed gives the same errors; its own stream stays as it is
+    """
+    series: dict[str, tuple[Array, Array]] = {}
+    for own, (name, belief) in zip(rng.spawn(len(beliefs(truth.config))), beliefs(truth.config).items(), strict=True):
+        lasts = belief.estimate and np.isfinite(belief.time_constant) and not of_waves(belief)
+        if truth.noise and lasts and name not in truth.calibration:
+            step = belief.time_constant / STEPS
+            time = step * np.arange(int(seconds / step) + 2.0)
+            white = belief.sd * own.standard_normal((len(time), belief.variable.dim))
+            white[0] = calibration[name] - belief.mean
+            series[name] = time, belief.mean + remembered(white, STEPS)
+    return LastingErrors(series)
+
 
 IMU_COLUMNS = ["acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"]
 MAG_COLUMNS = ["mag_x", "mag_y", "mag_z"]

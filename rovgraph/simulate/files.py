@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.config import Config, with_priors_stated
+from rovgraph.model.config import Config, with_priors_stated
 from rovgraph.sensors import SENSORS
 from rovgraph.simulate.dive import Dive
 

@@ -6,17 +6,16 @@ from importlib.resources import files
 
 import numpy as np
 
-from rovgraph.config import Config, config_or_defaults, parse_config
 from rovgraph.errors import InputError, kind_of
+from rovgraph.model.config import Config, config_or_defaults, parse_config
 from rovgraph.simulate.choices import Choices
 from rovgraph.simulate.dive import Dive, simulate
-from rovgraph.simulate.driven_scenarios import DRIVEN
+from rovgraph.simulate.driven import DRIVEN, World
+from rovgraph.simulate.environment import Magnetism, iron_near
 from rovgraph.simulate.files import known
-from rovgraph.simulate.magnetism import Magnetism, iron_near
 from rovgraph.simulate.path import Path
 from rovgraph.simulate.scenario import SCENARIOS, scenario
 from rovgraph.simulate.truth import Truth
-from rovgraph.simulate.worlds import World
 
 NAMES = tuple(dict.fromkeys([*SCENARIOS, *DRIVEN]))
 _KINEMATIC = frozenset({"duration", "speed"})
@@ -121,4 +120,4 @@ def lake() -> Config:
 
 def falcon() -> Config:
     """The configuration of the thesis's vehicle, ``falcon.yaml``."""
-    return parse_config((files("rovgraph.config") / "falcon.yaml").read_text(encoding="utf-8"), "falcon.yaml")
+    return parse_config((files("rovgraph.model") / "falcon.yaml").read_text(encoding="utf-8"), "falcon.yaml")

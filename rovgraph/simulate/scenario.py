@@ -11,9 +11,8 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.simulate.path import Path, Style, moving_time, path_along
-from rovgraph.simulate.route import Route
-from rovgraph.thesis import END_N
+from rovgraph.model.thesis import END_N
+from rovgraph.simulate.path import Path, Route, Style, moving_time, path_along
 
 Scenario = Callable[[float | None, float | None, Style], Path]
 FASTEST = 20.0  # [m/s]

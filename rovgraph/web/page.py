@@ -12,14 +12,12 @@ from rovgraph.errors import as_path, as_paths
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
-from rovgraph.web import connections
-from rovgraph.web.address import Address, listening, parse_address, parse_origin, token_of
+from rovgraph.web import broadcast
 from rovgraph.web.app import Offer, application
-from rovgraph.web.broadcast import Broadcast
+from rovgraph.web.broadcast import Broadcast, Connection, PageSocket
 from rovgraph.web.charts import read_charts
-from rovgraph.web.connections import Connection, PageSocket
-from rovgraph.web.guard import LARGEST_HEADERS, Guard
-from rovgraph.web.view import Limits, View
+from rovgraph.web.guard import LARGEST_HEADERS, Guard, ListenAddress, listening, parse_address, parse_origin, token_of
+from rovgraph.web.view import PageLimits, View
 
 START_S, CLOSE_S = 10.0, 2.0
 MOST_CONNECTIONS = 64
@@ -34,7 +32,7 @@ class LivePage:
     Parameters
     ----------
     address : ``host:port`` to listen at; another than the loopback asks for a token
-    offer : takes commands of pages, such as `rovgraph.live.feed.Feed.offer`; None = pages only look
+    offer : takes commands of pages, such as `rovgraph.live.session.Feed.offer`; None = pages only look
     marks : of the run, shown on the map
     charts : GeoTIFF or GeoJSON files, or folders of tiles, below the track
     origins : of other pages that may frame this one
@@ -60,7 +58,7 @@ class LivePage:
         charts: Sequence[Path | str] = (),
         origins: Sequence[str] = (),
         token: Path | str | None = None,
-        limits: Limits | None = None,
+        limits: PageLimits | None = None,
         warnings: Warnings | None = None,
     ) -> None:
         wanted, origins = parse_address(address), [parse_origin(origin) for origin in origins]
@@ -68,8 +66,8 @@ class LivePage:
         shown = read_charts(as_paths(charts, "charts"))
         self.token = None if wanted.loopback else token_of(None if token is None else as_path(token, "token"))
         self._socket = listening(wanted)
-        self.address = Address(wanted.host, self._socket.getsockname()[1])
-        self.broadcast = Broadcast(View(marks or Marks(), limits or Limits()))
+        self.address = ListenAddress(wanted.host, self._socket.getsockname()[1])
+        self.broadcast = Broadcast(View(marks or Marks(), limits or PageLimits()))
         guard = Guard(application(self.broadcast, shown, offer), self.token, origins)
         self._server = uvicorn.Server(
             uvicorn.Config(
@@ -79,8 +77,8 @@ class LivePage:
                 lifespan="on",
                 http=Connection,
                 ws=PageSocket,
-                ws_ping_interval=connections.PING_S,
-                ws_ping_timeout=connections.PONG_S,
+                ws_ping_interval=broadcast.PING_S,
+                ws_ping_timeout=broadcast.PONG_S,
                 ws_max_size=LARGEST_MESSAGE,
                 ws_per_message_deflate=False,
                 limit_concurrency=MOST_CONNECTIONS,

@@ -5,13 +5,10 @@ dropped, counted, and complained of once per kind and minute.
 """
 
 from rovgraph.errors import InputError
+from rovgraph.live.outputs.json_lines import StandardOutput, TcpOutput, UdpOutput
 from rovgraph.live.outputs.mavlink import MavlinkOutput
 from rovgraph.live.outputs.nmea import NmeaOutput
-from rovgraph.live.outputs.output import Output
-from rovgraph.live.outputs.standard import StandardOutput
-from rovgraph.live.outputs.tcp import TcpOutput
-from rovgraph.live.outputs.udp import UdpOutput
-from rovgraph.live.outputs.url import parsed
+from rovgraph.live.outputs.output import Output, parsed
 from rovgraph.live.warnings import Warnings
 
 __all__ = ["FORMS", "Output", "open_output"]

@@ -1,13 +1,24 @@
-"""NMEA 0183 sentences for chart plotters: GGA (position), HDT (true heading) and VTG (course and speed)."""
+"""NMEA 0183 sentences for chart plotters: GGA (position), HDT (true heading) and VTG (course and speed).
+
+What a GPS receiver would say, for those who only listen to one.
+"""
 
 import math
 from collections.abc import Iterator
 from functools import reduce
 from operator import xor
 
-from rovgraph.live.outputs.receiver import SATELLITES, dilution
-from rovgraph.live.outputs.udp import UdpOutput
+from rovgraph.live.outputs.json_lines import UdpOutput
 from rovgraph.live.solution import Solution
+
+SATELLITES = 10  # autopilots refuse fewer than six
+RANGE_ERROR = 5.0  # per unit of dilution of precision [m]
+
+
+def dilution(sd: float) -> float:
+    """Dilution of precision with which a receiver would be as uncertain as ``sd`` [m]."""
+    return sd / RANGE_ERROR
+
 
 TALKER = "GP"  # what the oldest plotter understands
 ESTIMATED = 6  # quality of a GGA: dead reckoning

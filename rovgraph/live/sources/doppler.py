@@ -1,22 +1,25 @@
 """Doppler instruments, live: PD4, PD5 and PD6 of Teledyne and others, Cerulean's Tracker 650, and Nortek's Nucleus.
 
-Their bytes are read as those of their files are (`rovgraph.interchange.pd4`, `pd6`, `cerulean` and `nucleus`).
+Their bytes are read as those of their files are (`rovgraph.readers.pd4`, `pd6`, `cerulean` and `nucleus`).
+
+Water Linked A50 and A125, live: reports over TCP, which `rovgraph.readers.waterlinked` reads.
 """
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
-from rovgraph.interchange import cerulean, nucleus
-from rovgraph.interchange.lines import Refused, shown
-from rovgraph.interchange.nortek_records import NUCLEUS_FAMILIES, find_records
-from rovgraph.interchange.pd4 import SIZES, Frames, decoded
-from rovgraph.interchange.pd6 import Sentences
-from rovgraph.interchange.recording import Channel
-from rovgraph.interchange.trdi_recording import channels_of
-from rovgraph.live.message import Message, readings
-from rovgraph.live.sources.lines import LineDecoder
-from rovgraph.live.sources.source import Chunk, Notify
+from rovgraph.live.message import Message, Reading, readings
+from rovgraph.live.sources.source import Chunk, LineDecoder, Notify
+from rovgraph.readers import cerulean, nucleus
+from rovgraph.readers.nortek import NUCLEUS_FAMILIES, find_records
+from rovgraph.readers.pd4 import SIZES, FrameCutter, decoded
+from rovgraph.readers.pd6 import Pd6Sentences
+from rovgraph.readers.recording import Channel
+from rovgraph.readers.records import Refused, json_object, shown
+from rovgraph.readers.trdi import channels_of
+from rovgraph.readers.waterlinked import STAMPED, VELOCITIES, VelocityReport, velocity_report
 
 PENDING = 1 << 14  # bytes that may be the beginning of a record; no Nucleus sends longer ones
 PASSWORD = b"enter password"
@@ -27,11 +30,11 @@ class Pd4Decoder:
 
     def __init__(self, url: str, notify: Notify) -> None:
         self._url, self._notify = url, notify
-        self._frames = Frames()
+        self._frames = FrameCutter()
 
     def feed(self, chunk: Chunk) -> Iterator[Message]:
         if chunk.fresh:
-            self._frames = Frames()
+            self._frames = FrameCutter()
         skipped = self._frames.skipped
         for frame in self._frames.feed(chunk.data):
             row = np.frombuffer(frame.ljust(SIZES[1], b"\0"), np.uint8)[None]
@@ -45,7 +48,7 @@ class Pd4Decoder:
 
 def pd6(url: str, notify: Notify) -> LineDecoder:
     """Decoder of PD6 sentences, stamped by the last ``:TS``."""
-    sentences = Sentences()
+    sentences = Pd6Sentences()
 
     def parse(line: bytes, arrival: float) -> Message | None:
         cells = sentences.columns(line)
@@ -105,3 +108,50 @@ def _messages(channels: Iterable[Channel], url: str, arrival: float, clock: str 
     for stamp in sorted(cells):
         if found := readings(cells[stamp]):
             yield Message(url, arrival, stamp, found, clock)
+
+
+PORT = 16171
+LONGEST_LATENCY_S = 5.0  # between validity and transmission; more is no latency
+
+
+def waterlinked(url: str, notify: Notify) -> LineDecoder:
+    """Decoder of a Water Linked DVL's reports."""
+    return LineDecoder(lambda line, arrival: report_message(json_object(line), url, arrival, notify), notify)
+
+
+def report_message(row: dict[str, Any], url: str, arrival: float, notify: Notify) -> Message | None:
+    """What a report says; None where it is about no measurement.
+
+    Raises
+    ------
+    Refused : the report is to be skipped
+    """
+    if row.get("type") in VELOCITIES and not str(row.get("format")).startswith(STAMPED):
+        text = f"format {shown(str(row.get('format')))}, expected {STAMPED}; update the DVL's software"
+        raise Refused("unknown format", text)
+    report = velocity_report(row)
+    if report is None:
+        return None
+    if report.fault:
+        notify("status", "the DVL reports a fault, such as being too hot; its velocities are used as long as valid")
+    readings = _readings(report)
+    return Message(url, arrival, report.validity, readings, latency=_latency(report)) if readings else None
+
+
+def _latency(report: VelocityReport) -> float | None:
+    if report.validity is None or report.transmission is None:
+        return None
+    latency = report.transmission - report.validity
+    return latency if 0.0 <= latency < LONGEST_LATENCY_S else None
+
+
+def _readings(report: VelocityReport) -> tuple[Reading, ...]:
+    """Velocity, and altitude where there is one."""
+    if report.water:
+        return () if report.velocity is None else (Reading("dvl_water", np.array(report.velocity)),)
+    if report.velocity is None:
+        return (Reading("dvl", np.array([np.nan, np.nan, np.nan, 0.0, np.nan])),)
+    found = [Reading("dvl", np.array([*report.velocity, 1.0, report.sd]))]
+    if report.altitude is not None:
+        found.append(Reading("dvl_altitude", np.array([report.altitude])))
+    return tuple(found)

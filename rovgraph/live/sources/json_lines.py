@@ -9,20 +9,19 @@ import math
 import numpy as np
 import pandas as pd
 
-from rovgraph.config import Config
 from rovgraph.dates import seconds_of_texts
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.interchange.lines import Refused, json_number, json_object, shown
-from rovgraph.interchange.waterlinked_reports import is_report
 from rovgraph.live.message import GEODETIC, Message, readings
-from rovgraph.live.sources.lines import LineDecoder
-from rovgraph.live.sources.source import Notify
-from rovgraph.live.sources.waterlinked import report_message
+from rovgraph.live.sources.doppler import report_message
+from rovgraph.live.sources.source import LineDecoder, Notify
 from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import Scale, near_miss, scales, turn_angles
+from rovgraph.model.config import Config
+from rovgraph.readers.records import Refused, json_number, json_object, shown
+from rovgraph.readers.waterlinked import is_report
 from rovgraph.sensors import SENSORS
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]

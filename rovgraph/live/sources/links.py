@@ -1,16 +1,23 @@
-"""Links to the outside: TCP, UDP, standard input, serial ports. All end within `STOP_S` or so."""
+"""Links to the outside: TCP, UDP, standard input, serial ports. All end within `STOP_S` or so.
+
+Links to files: as they are, and telemetry logs (.tlog), where a time stands before each message.
+"""
 
 import contextlib
+import gzip
 import os
 import select
 import socket
 import threading
 import time
+import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.live.sources.source import STOP_S, Chunk, Notify
+from rovgraph.readers.mavlink import frames_with_times
 
 BLOCK = 1 << 16  # bytes read at a time
 CONNECT_S = 3.0  # longest wait for an answer
@@ -239,3 +246,50 @@ def _serial() -> Any:
     except ImportError:
         raise InputError("serial ports need pyserial; install it with: pip install 'rovgraph[online]'") from None
     return serial
+
+
+def read_file(path: Path) -> bytes:
+    """A file, unpacked where it is gzipped.
+
+    Raises
+    ------
+    InputError : it cannot be read
+    """
+    try:
+        content = path.read_bytes()
+        return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+class FileLink:
+    """A file from its beginning to its end; it arrives when it was last written."""
+
+    def __init__(self, path: Path) -> None:
+        self._content = read_file(path)
+        self._arrival = path.stat().st_mtime
+
+    def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
+        for start in range(0, len(self._content), BLOCK):
+            if stop.is_set():
+                return
+            yield Chunk(self._content[start : start + BLOCK], self._arrival)
+        yield Chunk(b"\n", self._arrival)  # the last line may lack its end
+
+
+class TelemetryReplay:
+    """The messages of a telemetry log, one by one, each arriving when it was received."""
+
+    def __init__(self, path: Path) -> None:
+        self._content = read_file(path)
+
+    def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
+        for chunk in timed_frames(self._content):
+            if stop.is_set():
+                return
+            yield chunk
+
+
+def timed_frames(content: bytes) -> Iterator[Chunk]:
+    """Frames of a telemetry log; what stands between them and is none comes as a chunk too."""
+    return (Chunk(data, time, fresh=True) for data, time in frames_with_times(content))

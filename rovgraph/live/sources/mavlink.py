@@ -1,4 +1,4 @@
-"""MAVLink, live: what an autopilot tells of its sensors; `rovgraph.interchange.mavlink` reads the messages."""
+"""MAVLink, live: what an autopilot tells of its sensors; `rovgraph.readers.mavlink` reads the messages."""
 
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
@@ -6,23 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.config import Config
 from rovgraph.geometry import wrap_angle
-from rovgraph.interchange.ardupilot import density_of, surface_of
-from rovgraph.interchange.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, usec
-from rovgraph.interchange.mavlink_frames import Frames, dialect
-from rovgraph.interchange.pressure import depth
-from rovgraph.interchange.rates import too_slow
 from rovgraph.live.message import GEODETIC, Message, Reading
-from rovgraph.live.sources.preferred import Preferred
-from rovgraph.live.sources.source import Chunk, Notify
+from rovgraph.live.sources.source import Chunk, Notify, Preferred
+from rovgraph.model.config import Config
+from rovgraph.readers.ardupilot import density_of, depth, surface_of
+from rovgraph.readers.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, MavlinkFrames, dialect, usec
+from rovgraph.readers.recording import too_slow
 
 VEHICLE_COMPONENT = 1
 ENOUGH = 20  # samples of an IMU that tell its rate
 
 
 @dataclass(frozen=True)
-class Options:
+class MavlinkOptions:
     """What a URL may say.
 
     Attributes
@@ -63,13 +60,13 @@ class MavlinkDecoder:
         url: str,
         notify: Notify,
         config: Config,
-        options: Options,
+        options: MavlinkOptions,
         known: MutableMapping[str, float] | None = None,
     ) -> None:
         self._url = url
         self._notify = notify
         self._options = options
-        self._frames = Frames(dialect(), notify)
+        self._frames = MavlinkFrames(dialect(), notify)
         self._system = options.system
         self._known: MutableMapping[str, float] = {} if known is None else known
         self._parameters: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""NMEA 0183, live: headings, attitudes and fixes; `rovgraph.interchange.nmea_sentences` reads the sentences.
+"""NMEA 0183, live: headings, attitudes and fixes; `rovgraph.readers.nmea_sentences` reads the sentences.
 
 Headings become the log's `ahrs_yaw`, which is of a compass: one that is relative to true north is
 turned by the configuration's declination.
@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.config import Config
 from rovgraph.geometry import wrap_angle
-from rovgraph.interchange.lines import Refused
-from rovgraph.interchange.nmea_sentences import (
+from rovgraph.live.message import GEODETIC, Message, Reading
+from rovgraph.live.sources.source import LineDecoder, Notify, Preferred
+from rovgraph.model.config import Config
+from rovgraph.readers.nmea_sentences import (
     ATTITUDES,
     DATES,
     FIXES,
     HEADINGS,
     TRUE,
     WITHOUT_CHECKSUM,
-    Times,
+    SentenceTimes,
     attitude_of,
     east,
     fix_of,
@@ -29,10 +30,7 @@ from rovgraph.interchange.nmea_sentences import (
     parsed,
     sentence_of,
 )
-from rovgraph.live.message import GEODETIC, Message, Reading
-from rovgraph.live.sources.lines import LineDecoder
-from rovgraph.live.sources.preferred import Preferred
-from rovgraph.live.sources.source import Notify
+from rovgraph.readers.records import Refused
 
 
 def nmea(url: str, notify: Notify, config: Config, recorded: bool = False) -> LineDecoder:
@@ -46,10 +44,10 @@ def nmea(url: str, notify: Notify, config: Config, recorded: bool = False) -> Li
     ------
     InputError : pynmea2 is not installed
     """
-    return LineDecoder(Sentences(url, notify, config, recorded).message, notify)
+    return LineDecoder(NmeaDecoder(url, notify, config, recorded).message, notify)
 
 
-class Sentences:
+class NmeaDecoder:
     """From a sentence to a message; see `nmea`."""
 
     def __init__(self, url: str, notify: Notify, config: Config, recorded: bool) -> None:
@@ -57,7 +55,7 @@ class Sentences:
         library()
         self._declination = config.environment.declination_deg
         self._recorded = recorded
-        self._times = Times()
+        self._times = SentenceTimes()
         self._notify = notify
         self._bare: int | None = 0  # sentences so far, as long as none has a checksum
         self._headings = Preferred((*ATTITUDES, *HEADINGS), notify)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pymap3d
 
-from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources.source import paced
 from rovgraph.log import Log, read_log
+from rovgraph.model.config import Config
 
 
 @dataclass(frozen=True)

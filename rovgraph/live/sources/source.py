@@ -1,13 +1,19 @@
-"""A source of messages: a link that yields bytes, and a decoder that makes messages of them."""
+"""A source of messages: a link that yields bytes, and a decoder that makes messages of them.
+
+Decoders of bytes that work line by line.
+
+One of several kinds of message that say the same.
+"""
 
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from rovgraph.live.message import Message
+from rovgraph.readers.records import Refused
 
 STOP_S = 0.2  # longest wait of a link before it looks whether it shall stop
 
@@ -113,3 +119,100 @@ def paced(
         if stop.wait(max(0.0, begin + (message.arrival - first) / pace - time.monotonic())):
             return
         yield message._replace(arrival=message.arrival + offset) if pace == 1.0 else message
+
+
+LONGEST = 1 << 16  # bytes of a line
+
+
+class LineDecoder:
+    """Splits bytes into lines and makes a message of each.
+
+    Parameters
+    ----------
+    parse : from a line without its end, not empty, and its arrival to a message, or None where it
+        says nothing of a sensor; raises `Refused`
+    notify : takes warnings
+    """
+
+    def __init__(self, parse: Callable[[bytes, float], Message | None], notify: Notify) -> None:
+        self._parse = parse
+        self._notify = notify
+        self._rest = b""
+        self._skipping = False  # within a line that is too long
+
+    def feed(self, chunk: Chunk) -> Iterator[Message]:
+        if chunk.fresh:
+            self._rest, self._skipping = b"", False
+        *lines, rest = chunk.data.split(b"\n")
+        if lines:
+            lines[0] = self._rest + lines[0]
+            self._rest = b""
+            if self._skipping:
+                self._skipping = False
+                del lines[0]
+        self._keep(rest)
+        for line in lines:
+            message = self._message(line, chunk.arrival)
+            if message is not None:
+                yield message
+
+    def _keep(self, rest: bytes) -> None:
+        """The beginning of a line, unless it is too long already."""
+        if self._skipping:
+            return
+        self._rest += rest
+        if len(self._rest) > LONGEST:
+            self._rest, self._skipping = b"", True
+            self._notify("too long", f"a line of more than {LONGEST} bytes is skipped")
+
+    def _message(self, line: bytes, arrival: float) -> Message | None:
+        line = line.strip()
+        try:
+            if len(line) > LONGEST:
+                raise Refused("too long", f"a line of more than {LONGEST} bytes is skipped")
+            return self._parse(line, arrival) if line else None
+        except Refused as refused:
+            self._notify(refused.kind, refused.text)
+            return None
+
+
+PATIENCE_S = 5.0  # silence after which a lesser kind takes over
+
+
+class Preferred:
+    """Takes one kind of message: the best one that is heard, so that nothing is counted twice.
+
+    Parameters
+    ----------
+    kinds : best first
+    notify : takes warnings
+    """
+
+    def __init__(self, kinds: Sequence[str], notify: Notify) -> None:
+        self._kinds = tuple(kinds)
+        self._notify = notify
+        self._current: str | None = None
+        self._heard = 0.0
+
+    def takes(self, kind: str, arrival: float) -> bool:
+        """Whether a message of this kind is taken.
+
+        Parameters
+        ----------
+        kind : of the message
+        arrival : seconds since 1970
+        """
+        if kind not in self._kinds:
+            return False
+        if kind != self._current and self._takes_over(kind, arrival):
+            if self._current is not None:
+                self._notify("switched", f"{kind} is read from now on, in the place of {self._current}")
+            self._current = kind
+        if kind == self._current:
+            self._heard = arrival
+        return kind == self._current
+
+    def _takes_over(self, kind: str, arrival: float) -> bool:
+        if self._current is None or arrival - self._heard > PATIENCE_S:
+            return True
+        return self._kinds.index(kind) < self._kinds.index(self._current)

@@ -1,0 +1,3 @@
+"""The version, which results, pages and exports carry."""
+
+__version__ = "0.1.0"

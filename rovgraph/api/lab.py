@@ -1,0 +1,469 @@
+"""Many simulated dives, to see what can be known: what ``rovgraph study`` does.
+
+Estimators against each other: what ``rovgraph compare`` does.
+
+Observability of the calibration: what ``rovgraph observe`` and ``rovgraph plan`` do.
+
+Calibrations from a log of their own: what ``rovgraph calibrate`` does.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from rovgraph.api.logs import config_of, prepared
+from rovgraph.errors import InputError, as_path, collected_warnings, kind_of
+from rovgraph.inference.trajectory import Trajectory
+from rovgraph.lab import calibrate as library
+from rovgraph.lab import compare as comparisons
+from rovgraph.lab import executors
+from rovgraph.lab.calibrate import MagnetometerCalibration, NoiseReport
+from rovgraph.lab.choices import goals as read_goals
+from rovgraph.lab.choices import listed, read_known
+from rovgraph.lab.compare import Comparison
+from rovgraph.lab.estimators import select
+from rovgraph.lab.evaluate import read_reference
+from rovgraph.lab.misalignment import Tables, chosen, open_results, read_study
+from rovgraph.lab.misalignment import study as study_cells
+from rovgraph.lab.misalignment.results import kept_so_far
+from rovgraph.lab.observability import Observability, estimating
+from rovgraph.lab.observability import observe as observe_calibration
+from rovgraph.lab.plan import KnownComponents, Plan, SensorRates
+from rovgraph.lab.plan import manoeuvres as candidates_of
+from rovgraph.lab.plan import plan as ranked
+from rovgraph.lab.runs import Case, Recorded, Run, Simulated
+from rovgraph.log import Log
+from rovgraph.model.config import Config, completed, config_or_defaults
+from rovgraph.process import Progress, no_progress
+from rovgraph.simulate.named import require_known
+
+
+def study_misalignment(
+    study: Path | str,
+    out: Path | str,
+    resume: bool = False,
+    only: str | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress = no_progress,
+) -> Tables:
+    """Study how well the DVL's misalignment can be estimated; every finished dive is saved at once.
+
+    Parameters
+    ----------
+    study : YAML file of the study (docs/studies.md)
+    out : results folder
+    resume : continue with the files in the folder
+    only : one cell, by the first characters of its id; None = all
+    jobs : processes on this machine; None = one per core
+    scheduler : address of a Dask cluster, such as ``tcp://host:8786``; None = this machine
+    progress : called at times with the current task and its progress from 0 to 1
+
+    Returns
+    -------
+    Tables : ``.runs``, ``.cells`` and ``.history``, also written into the folder
+
+    Raises
+    ------
+    InputError : an invalid study, a folder that exists or holds another study, a cluster that does not answer,
+        a full disk (what was written before is kept)
+    """
+    from rovgraph.report.figures_studies import draw_study
+    from rovgraph.report.pages.reporting import write_page
+    from rovgraph.report.study import write_study
+
+    plan = read_study(as_path(study, "study"))
+    cells = chosen(plan, only)
+    if scheduler is not None and jobs is not None:
+        raise InputError("--jobs cannot be combined with --scheduler; the cluster decides the number of workers")
+    engine = executors.Local(jobs) if scheduler is None else executors.Cluster(scheduler)
+    folder = as_path(out, "out")
+    results = open_results(folder, plan, resume)
+    began = time.perf_counter()
+    tables = study_cells(plan, results, cells, engine, lambda done: progress("making dives", done))
+    with kept_so_far(folder):  # its rows are on disk already
+        write_study(folder, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
+        draw_study(folder, tables)
+        write_page(folder)
+    return tables
+
+
+SEEDS = range(1, 31)
+THESIS = "vattern"  # the scenario of the thesis, whose numbers are shown beside ours
+
+
+@dataclass(frozen=True)
+class ComparisonResult:
+    """Errors, consistency and cost of each estimator.
+
+    Attributes
+    ----------
+    comparison : all tables; docs/compare.md describes their columns
+    title : log or scenario
+    thesis : whether the thesis has numbers for it
+    about : its inputs, for ``summary.json``
+    """
+
+    comparison: Comparison
+    title: str
+    thesis: bool
+    about: dict[str, Any]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per estimator."""
+        return self.comparison.table
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph compare`` (docs/compare.md), complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.comparison import write_comparison
+        from rovgraph.report.figures_studies import draw_comparison
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force) as folder:
+            draw_comparison(folder, self.comparison, self.title, self.thesis)
+            write_comparison(folder, self.comparison, self.about)
+            write_page(folder)
+
+
+def compare(
+    log: Log | None = None,
+    config: Config | None = None,
+    reference: Trajectory | Path | str | None = None,
+    scenario: str | None = None,
+    seeds: Sequence[int] = SEEDS,
+    duration: float | None = None,
+    estimators: str | Sequence[str] | None = None,
+    jobs: int | None = None,
+    progress: Progress = no_progress,
+) -> ComparisonResult:
+    """Run estimators on a log with its reference, or on many simulated dives.
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : of vehicle and sensors; None = all defaults, or the scenario's
+    reference : the track that the log's estimates are compared with, or its file
+    scenario : simulate dives of this one instead of a log
+    seeds : of the simulated dives
+    duration : of a simulated dive [s]; None = the scenario's
+    estimators : names or patterns, such as "graph-*", a list or separated by commas; None = all that need no thrusters
+    jobs : processes; None = one per core
+    progress : called at times with the current task and its progress from 0 to 1
+
+    Raises
+    ------
+    InputError : neither or both of log and scenario, an unknown estimator, a log that cannot be used
+
+    Warns
+    -----
+    DataWarning : findings of the check
+    """
+    names = None if estimators is None else listed(estimators)
+    select(names)
+    require_one(log, reference, scenario, seeds, duration)
+    runs: list[Run]
+    about: dict[str, Any]
+    if scenario is not None:
+        require_known(scenario)
+        runs = [Simulated(scenario, seed, config, duration) for seed in seeds]
+        about = {"scenario": scenario, "seeds": [*seeds], "duration_s": duration}
+        title = f"{scenario}, {len(seeds)} seeds"
+    else:
+        assert log is not None
+        assert reference is not None
+        config, title, about = config_of(log, config), Path(log.source).name, {"log": log.source}
+        if isinstance(reference, Path | str):
+            about["reference"] = str(reference)
+            reference = read_reference(reference)
+        if not isinstance(reference, Trajectory):
+            raise InputError(f"reference: expected a path or a Trajectory, found {kind_of(reference)}")
+        runs = [Recorded(title, Case(prepared(log, config)[0], config, reference))]
+    began = time.perf_counter()
+    comparison = comparisons.compare(runs, names, jobs, lambda done: progress("comparing", done))
+    about["seconds"] = time.perf_counter() - began
+    return ComparisonResult(comparison, title, scenario == THESIS, about)
+
+
+def require_one(
+    log: object, reference: object, scenario: str | None, seeds: Sequence[int], duration: float | None
+) -> None:
+    """Either a log with its reference, or a scenario.
+
+    Raises
+    ------
+    InputError : anything else
+    """
+    if (log is None) == (scenario is None):
+        raise InputError("compare wants either a log with its reference, or a scenario to simulate")
+    if scenario is not None:
+        if reference is not None:
+            raise InputError("a reference goes with a log; a simulated dive has its own")
+        if not (isinstance(seeds, Sequence) and len(seeds)):
+            raise InputError(f"seeds: expected a list or range of at least one, found {seeds!r}")
+        return
+    if duration is not None:
+        raise InputError("a duration goes with a scenario; a log has its own")
+    if reference is None:
+        source = log.source if isinstance(log, Log) else log
+        raise InputError(f"{source}: a reference (CSV with time, north, east) is needed to compare with")
+
+
+DURATION_S = 120.0  # of a manoeuvre
+USUAL = SensorRates()
+
+
+@dataclass(frozen=True)
+class ObservabilityResult:
+    """The observability of the calibration in a dive.
+
+    Attributes
+    ----------
+    observability : sd before and after, correlations, and sd against time
+    config : of vehicle and sensors, including the variables estimated
+    warnings : findings on the log, a line each
+    about : its inputs, for ``summary.json``
+    """
+
+    observability: Observability
+    config: Config
+    warnings: tuple[str, ...]
+    about: Mapping[str, Any]
+
+    @property
+    def verdicts(self) -> Mapping[str, str]:
+        """Label of each component -> observable, weak or unobservable."""
+        return dict(zip(self.observability.labels, self.observability.verdicts, strict=True))
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph observe`` (docs/observability.md), complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.figures_studies import draw_observability
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.observability import write_observability
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force) as folder:
+            draw_observability(folder, self.observability)
+            write_observability(folder, self.observability, self.config, self.about)
+            write_page(folder)
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """Manoeuvres, ranked by the information they would add.
+
+    Attributes
+    ----------
+    plan : the manoeuvres, the best first
+    config : of vehicle and sensors
+    about : its inputs, for ``summary.json``
+    """
+
+    plan: Plan
+    config: Config
+    about: Mapping[str, Any]
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph plan`` (docs/observability.md), complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.figures_studies import draw_plan
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.observability import write_plan
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force) as folder:
+            draw_plan(folder, self.plan)
+            write_plan(folder, self.plan, self.config, self.about)
+            write_page(folder)
+
+
+def observe(
+    log: Log, config: Config | None = None, estimate: str | Sequence[str] = (), progress: Progress = no_progress
+) -> ObservabilityResult:
+    """Determine how well a dive shows each calibration variable, when it did, and what is missing.
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : of vehicle and sensors; None = all defaults
+    estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
+    progress : called at times with the current task and its progress from 0 to 1
+
+    Raises
+    ------
+    InputError : an unknown variable, one whose sensor is not used, no variable at all, a log that cannot be used
+
+    Warns
+    -----
+    DataWarning : findings of the check
+    """
+    estimate = listed(estimate)
+    config = estimating(config_of(log, config), estimate)
+    with collected_warnings() as texts:
+        log, _ = prepared(log, config)
+        seen = observe_calibration(log, config, estimate, progress)
+    about = {"log": log.source, "estimate": [*estimate]}
+    return ObservabilityResult(seen, config, (*log.warnings, *texts), about)
+
+
+def plan(
+    config: Config | None = None,
+    goals: Mapping[str, float] | Sequence[str] | None = None,
+    known: ObservabilityResult | Path | str | None = None,
+    duration: float = DURATION_S,
+    manoeuvres: str | Sequence[str] | None = None,
+    estimate: str | Sequence[str] = (),
+    sensors: SensorRates = USUAL,
+    progress: Progress = no_progress,
+) -> PlanResult:
+    """Rank manoeuvres by how well they would determine the calibration, before the dive.
+
+    Parameters
+    ----------
+    config : of vehicle and sensors; None = all defaults
+    goals : label of a component -> wanted sd, radians and SI; or texts such as "dvl_yaw=1deg"
+    known : result of an earlier dive, or its ``observability.json``; None = none
+    duration : of each manoeuvre [s]
+    manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all
+    estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
+    sensors : their rates
+    progress : called at times with the current task and its progress from 0 to 1
+
+    Raises
+    ------
+    InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
+    """
+    config = estimating(config_or_defaults(config), listed(estimate))
+    candidates = candidates_of(listed(manoeuvres) or None, duration)
+    wanted = read_goals(goals)
+    before: KnownComponents | None
+    if isinstance(known, ObservabilityResult):
+        seen, source = known.observability, known.about["log"]
+        before = KnownComponents(seen.labels, seen.covariance, seen.prior_sd)
+    else:
+        before, source = (None, None) if known is None else (read_known(as_path(known, "known")), str(known))
+    result = ranked(config, candidates, duration, before, wanted, sensors, lambda done: progress("manoeuvres", done))
+    about = {"duration_s": duration, "known": source, "fix_interval_s": sensors.fix_interval}
+    return PlanResult(result, config, about)
+
+
+@dataclass(frozen=True)
+class MagnetometerResult:
+    """Hard and soft iron of a magnetometer.
+
+    Attributes
+    ----------
+    found : centre, matrix, disturbances, and how well the samples fit
+    config : the configuration to which the calibration is added
+    """
+
+    found: MagnetometerCalibration
+    config: Config
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph calibrate magnetometer`` (docs/calibration.md), complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.calibrations import write_magnetometer
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
+            write_magnetometer(folder, self.found, self.config)
+            write_page(folder)
+
+
+@dataclass(frozen=True)
+class NoiseResult:
+    """Noise of the sensors at rest.
+
+    Attributes
+    ----------
+    found : channels with densities and bias instability, lines in the spectra, remarks
+    config : the configuration to which the noise is added
+    """
+
+    found: NoiseReport
+    config: Config
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph calibrate noise`` (docs/calibration.md), complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.calibrations import write_noise
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
+            write_noise(folder, self.found, self.config)
+            write_page(folder)
+
+
+def calibrate_magnetometer(
+    log: Log, config: Config | None = None, method: library.Method = "ellipsoid"
+) -> MagnetometerResult:
+    """Determine hard and soft iron from a log in which the vehicle turns about all its axes.
+
+    Parameters
+    ----------
+    log : read with the configuration's ``with_raw_magnetometer()``, so that its samples are uncorrected
+    config : of vehicle and sensors; None = all defaults
+    method : "ellipsoid", or "turns" for a turn about z and one about x
+
+    Raises
+    ------
+    InputError : no magnetometer, too few samples, samples that are calibrated already, or too little turning
+    """
+    config = config_or_defaults(config)
+    raw = config.with_raw_magnetometer()
+    if isinstance(log, Log) and log.config is not None and log.config.imu.mag != raw.imu.mag:
+        raise InputError(
+            f"{log.source}: its magnetometer was calibrated as it was read; read it with config.with_raw_magnetometer()"
+        )
+    found = library.calibrate_magnetometer(log, config_of(log, raw), method)
+    return MagnetometerResult(found, _completed(config, log))
+
+
+def calibrate_noise(log: Log, config: Config | None = None) -> NoiseResult:
+    """Determine the noise of IMU, DVL and compasses from a log at rest.
+
+    Parameters
+    ----------
+    log : as read with the configuration; the vehicle is at rest in it, waves are tolerated
+    config : of vehicle and sensors; None = all defaults
+
+    Raises
+    ------
+    InputError : the vehicle moves, the log is too short, or ``rovgraph[calibrate]`` is not installed
+    """
+    config = config_of(log, config)
+    return NoiseResult(library.calibrate_noise(log, config), config)
+
+
+def _completed(config: Config, log: Log) -> Config:
+    return completed(config, log.settings, f"settings in {log.source}")[0]

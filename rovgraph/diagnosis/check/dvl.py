@@ -1,0 +1,138 @@
+"""The DVL against the IMU by their accelerations: axes, mounting, clock, and jumps of a clock.
+
+Nothing else is needed: no heading, no depth, no change of depth.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rovgraph.diagnosis.check.acceleration import BETTER, AccelerationFit, DvlAgainstImu, Search
+from rovgraph.diagnosis.check.agreement import dives_with_depth
+from rovgraph.diagnosis.check.clocks import Examined, compare, find_jump
+from rovgraph.diagnosis.check.findings import Finding, believed_lag
+from rovgraph.diagnosis.check.lags import ORIENTATIONS
+from rovgraph.geometry import Array, log_rotation
+from rovgraph.log import Log
+from rovgraph.model.config import Config, beliefs, mount_matrix
+from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
+from rovgraph.sensors.dvl import axes_remedy
+
+SIMILAR = 1.1  # times the least error, that tells two orientations apart no more
+SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
+APART = 0.15  # that search and fit may be apart [s]
+TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
+
+
+def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> Iterator[Finding]:
+    """Axes, mounting and clock of the DVL, by the IMU's accelerations; ``examined`` is of `bridge_jumps`."""
+    compared = compare(log, config) if examined is None else examined.compared
+    if compared is None:
+        return
+    found = compared.search()
+    if np.isfinite(found.error).sum() == 0:
+        return
+    jump = find_jump(log, compared) if examined is None else examined.jump
+    if jump is not None:
+        yield jump.finding(log)
+        return
+    if (earth := _earth_axes(compared, found)) is not None:
+        yield earth
+        return
+    k, m = _explanation(found)
+    if found.agreement[k, m] < ACCELERATION.follows:
+        yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
+        return
+    if k:
+        k = _upright(log, config, found, m)
+    fit = compared.refine(float(found.lags[m]), ORIENTATIONS[k])
+    if fit is None:
+        return
+    better = found.error[0, found.now] / found.error[k, m]
+    yield _mounting(config, k, fit, f"corrected, its acceleration agrees {better:.1f} times better with the IMU's")
+    yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
+
+
+def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
+    """Whether the velocities are along Earth's axes."""
+    turning, best = compared.turning(), float(found.agreement.max())
+    if turning is None or turning.not_at_all < ACCELERATION.follows:
+        return None
+    best = max(best, turning.with_vehicle)
+    if 1.0 - best < BETTER * (1.0 - turning.not_at_all):
+        return None
+    text = (
+        "its velocities are along axes that do not turn with the vehicle, as Earth's: so taken they agree with the "
+        f"IMU's acceleration (agreement {turning.not_at_all:.2f}, {best:.2f} along the vehicle's): log the DVL's own "
+        "axes (instrument or ship coordinates)"
+    )
+    return Finding("dvl", "warning", text, "axes")
+
+
+def _explanation(found: Search) -> tuple[int, int]:
+    """Orientation and lag, by their indices: as configured unless another is far better, and one of the two if it does.
+
+    A dive's legs are similar, so shifted or turned they may agree almost as well as when they are right.
+    """
+    both = np.unravel_index(int(np.argmin(found.error)), found.error.shape)
+    axes, lag = int(np.argmin(found.error[:, found.now])), int(np.argmin(found.error[0]))
+    least = found.error[both]
+    if found.error[0, found.now] < BETTER * least or found.agreement[both] < ACCELERATION.follows:
+        near = np.abs(found.lags) <= 1.0  # small lags do not make errors twice as large
+        return 0, int(np.flatnonzero(near)[np.argmin(found.error[0, near])])
+    if found.error[0, lag] < SIMPLER * least:
+        return 0, lag
+    if found.error[axes, found.now] < SIMPLER * least:
+        return axes, found.now
+    return int(both[0]), int(both[1])
+
+
+def _upright(log: Log, config: Config, found: Search, m: int) -> int:
+    """The one to believe of orientations that agree equally well, as both senses of the vertical do on a level dive.
+
+    Depth decides; where it shows nothing, an instrument is rather mounted in another way than left-handed.
+    """
+    error = found.error[:, m]
+    similar = np.flatnonzero(error < SIMILAR * error.min())
+    R_bs = mount_matrix(config.dvl.mount_rpy_deg)
+    by_depth = [dives_with_depth(log, config, R_bs @ ORIENTATIONS[k]) for k in similar]
+    if max(by_depth) > ACCELERATION.follows:
+        return int(similar[int(np.argmax(by_depth))])
+    handed = np.linalg.det(ORIENTATIONS[similar]) > 0.0
+    chosen = similar[handed] if handed.any() else similar
+    return int(chosen[int(np.argmin(error[chosen]))])
+
+
+def _mounting(config: Config, k: int, fit: AccelerationFit, better: str) -> Finding:
+    """Whether the mounting of a fit is that of the configuration."""
+    R_bs = mount_matrix(config.dvl.mount_rpy_deg)
+    turn = log_rotation((fit.R_bs @ (R_bs @ ORIENTATIONS[k]).T)[None])[0]
+    yaw = beliefs(config)["dvl_yaw"]
+    believed = np.array([0.0, 0.0, yaw.sd if yaw.estimate else 0.0])
+    turned = bool((np.abs(turn) > np.maximum(TURNED, SURE * np.hypot(fit.turn_sd, believed))).any())
+    if k == 0 and not turned:
+        return Finding(
+            "dvl", "ok", f"its acceleration agrees with the IMU's, axes as configured (agreement {fit.agreement:.2f})"
+        )
+    if turned and np.linalg.det(fit.R_bs) > 0.0:
+        cause, remedy = axes_remedy(np.eye(3), fit.R_bs)
+        better = "its acceleration shows this" if k == 0 else better
+    else:
+        cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
+    return Finding("dvl", "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}", "axes")
+
+
+def _clock(config: Config, compared: DvlAgainstImu, H: Array, fit: AccelerationFit, coarse: float) -> Finding:
+    """Whether the stamps are late, by the fit and by the search, whose errors are others."""
+    believed = believed_lag(config, "dvl")
+    late = fit.lag - believed[0]
+    sense = "late" if late >= 0.0 else "early"
+    text = f"its stamps are {abs(late):.3f} s {sense} relative to the IMU's (sd {fit.lag_sd:.3f} s)"
+    if not ACCELERATION.is_late(fit.lag, fit.lag_sd, believed):
+        return Finding("dvl", "ok", text)
+    if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - believed[0]) < 0.5 * abs(late):
+        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
+    as_stamped = compared.refine(believed[0], H, held=True)
+    if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < ACCELERATION.evidence:
+        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
+    return Finding("dvl", "warning", f"{text}: {remedy_of_lag(config, 'dvl', fit.lag, fit.lag_sd)}", "lag")

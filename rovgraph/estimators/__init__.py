@@ -1,1 +1,0 @@
-"""Estimators: each turns a log and a configuration into an `Estimate`."""

@@ -1,0 +1,622 @@
+"""Where a dive begins, and what the configuration leaves to the log.
+
+Attitude comes from gravity (specific force averaged in the axes of the first sample)
+and heading from whatever the log has; the gyro's bias from standing still, where it
+stands still. An explicit ``start`` goes before all of it.
+
+What heading sources say of an attitude: by which angle about down it is to be turned.
+
+All of it through the instruments' own models, so it serves every source alike.
+
+What the first seconds of a log say: how it is levelled, whether it stands still, its heading, where it is.
+
+Nothing rests on a single sample: the first of a sensor is as often wrong as any other, and here
+no gate would find out.
+
+Whether a dive is reckoned without an IMU, and where it then begins.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import (
+    Array,
+    earth_rate_n,
+    exp_rotation,
+    level_from_force,
+    matrix_from_rpy,
+    rotate,
+    rpy_from_matrix,
+    transpose,
+    wrap_angle,
+)
+from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_compass
+from rovgraph.kernels.assembly import NOISIER
+from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import CLEAR_SPEED
+from rovgraph.model.calibration import AUTO, CONSIDERED, TABLE, Belief
+from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
+from rovgraph.model.state import POSE, Jacobians, State
+from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
+from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
+from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
+
+MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
+
+
+class TurnNoise(NamedTuple):
+    """How a turn that a source asks for errs.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (n,), by the noise of each measurement [rad^2]
+    by_tilt : ndarray, shape (n,), its square by that of a tilt, either axis
+    deviation_var : by what is believed of the source's calibration, as far as that changes with the heading [rad^2]
+    """
+
+    variance: Array
+    by_tilt: Array
+    deviation_var: float
+
+
+def by_accuracy(config: Config, sources: list[str]) -> list[str]:
+    """Heading sources with those first whose offset is held fixed, or known best.
+
+    Parameters
+    ----------
+    config : priors of the offsets
+    sources : of `rovgraph.sensors.instruments.HEADING_STREAMS`
+    """
+    priors = beliefs(config)
+    return sorted(sources, key=lambda s: priors[OFFSETS[s]].sd if priors[OFFSETS[s]].estimate else 0.0)
+
+
+def solve_turn(instrument: Instrument, z: Array, R_nb: Array, calibration: Mapping[str, Array]) -> Array:
+    """Angles about down by which attitudes are turned to predict measurements best, shape (n,) [rad].
+
+    By Gauss-Newton. A heading is about linear in the turn, so any beginning will do; a vector goes round in a
+    circle, which is known from four points of it.
+
+    Parameters
+    ----------
+    instrument : a heading source
+    z : ndarray, shape (n, dim)
+    R_nb : ndarray, shape (n, 3, 3), attitudes, of which roll and pitch count
+    calibration : name -> ndarray, shape (dim of variable,), all that the instrument depends on
+    """
+    model, still, turn = instrument.model, np.zeros((len(z), 3)), np.zeros(len(z))
+    if not model.angular:
+        a, b, c, d = (
+            model.predict(_turn_about_down(R_nb, np.full(len(z), side), calibration), still)[0]
+            for side in np.arange(4) * 0.5 * np.pi
+        )
+        beyond = z - 0.25 * (a + b + c + d)
+        turn = np.arctan2(np.sum((b - d) * beyond, axis=1), np.sum((a - c) * beyond, axis=1))
+    for _ in range(MOST_STEPS):
+        there = _turn_about_down(R_nb, turn, calibration)
+        predicted, H = model.predict(there, still)
+        step = np.sum(_weigh_components(there, H) * innovation(model, z, predicted), axis=1)
+        turn = turn + step
+        if np.abs(step).max(initial=0.0) < FOUND_WITHIN:
+            break
+    return wrap_angle(turn)
+
+
+def turn_noise(
+    instrument: Instrument, R_nb: Array, turn: Array, calibration: Mapping[str, Array], priors: Mapping[str, Belief]
+) -> TurnNoise:
+    """How turns err that are found by `solve_turn`.
+
+    Parameters
+    ----------
+    instrument, R_nb, calibration : as of `solve_turn`
+    turn : ndarray, shape (n,) [rad]
+    priors : of all calibration variables
+    """
+    there = _turn_about_down(R_nb, turn, calibration)
+    _, H = instrument.model.predict(there, np.zeros((len(turn), 3)))
+    by_z = _weigh_components(there, H)
+    tilts_n = H[POSE][..., :3] @ transpose(there.R_nb)[..., :2]
+    estimated = [belief for name, belief in priors.items() if belief.estimate and name in H]
+    by_calibration = [belief.sd * np.einsum("nd,ndk->nk", by_z, H[belief.variable.name]) for belief in estimated]
+    return TurnNoise(
+        np.sum((by_z * instrument.sd) ** 2, axis=1),
+        np.sum(np.einsum("nd,ndk->nk", by_z, tilts_n) ** 2, axis=1),
+        float(sum(turns.var(axis=0).sum() for turns in by_calibration)),
+    )
+
+
+def _turn_about_down(R_nb: Array, turn: Array, calibration: Mapping[str, Array]) -> State:
+    nowhere, down = np.zeros((len(turn), 3)), np.zeros((len(turn), 3))
+    down[:, 2] = turn
+    return State(exp_rotation(down) @ R_nb, nowhere, nowhere, np.zeros((len(turn), 6)), calibration)
+
+
+def _weigh_components(there: State, H: Jacobians) -> Array:
+    """The turn that best explains a measurement by its components, shape (n, dim)."""
+    slope = np.einsum("ndk,nk->nd", H[POSE][..., :3], there.R_nb[:, 2, :])  # a turn about down is R_bn e_z in b
+    return np.asarray(slope / np.maximum(np.sum(slope**2, axis=1), 1e-12)[:, None])
+
+
+WINDOW_S = 5.0  # over which a log is levelled, and a sensor's first value taken
+WITHIN_S = 30.0  # from the log's start: first headings and fixes
+QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that counts as quiet [SI]
+STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
+HEADINGS = 50  # samples of a source that are looked at
+UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
+FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
+AGREE_SD = 3.0  # of a fix with the line through those around it
+MOST_MPS = 1.0  # that a vehicle moves before anything says where it is
+
+
+class Level(NamedTuple):
+    """The IMU's first seconds.
+
+    Attributes
+    ----------
+    force_b, rate_b : ndarray, shape (3,), mean specific force in the axes of the first sample, mean rate
+    quiet : whether it stands still
+    seconds : that there are
+    """
+
+    force_b: Array
+    rate_b: Array
+    quiet: bool
+    seconds: float
+
+    @property
+    def shows_bias(self) -> bool:
+        """Whether the mean rate is the gyro's bias."""
+        return self.quiet and self.seconds >= 1.0
+
+
+def level(log: Log, config: Config) -> Level:
+    """What the IMU says of the first seconds.
+
+    Parameters
+    ----------
+    log : with an IMU
+    config : its mounting and noise
+    """
+    imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
+    first = imu.time <= imu.time[0] + WINDOW_S
+    time, acc, gyr = imu.time[first], imu.data[first, :3] @ R_bs.T, imu.data[first, 3:] @ R_bs.T
+    seconds = float(time[-1] - time[0])
+    if len(time) < 3:
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), False, seconds)
+    rate = (len(time) - 1) / seconds
+    noise = config.imu.noise
+    quiet = bool(
+        (acc.std(axis=0) < QUIET_ACC + 2.0 * noise.acc * np.sqrt(rate)).all()
+        and (gyr.std(axis=0) < QUIET_GYR + 2.0 * noise.gyr * np.sqrt(rate)).all()
+        and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * np.deg2rad(config.imu.gyr_bias_sd_dps)
+    )
+    if quiet and not _moves(log):
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds)
+    return Level(rotate(_turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
+
+
+def _moves(log: Log) -> bool:
+    """Whether DVL or compass say so: a steady turn is as quiet as standing still."""
+    if "dvl" in log:
+        ping = _opening(log["dvl"], log["imu"].time[0], WINDOW_S)
+        speed = np.linalg.norm(ping.data[ping["dvl_valid"] == 1.0, :3], axis=1)
+        if len(speed) and np.median(speed) > CLEAR_SPEED:
+            return True
+    for source in ("ahrs", "dvl_heading"):
+        if source in log:
+            heading = np.unwrap(_opening(log[source], log["imu"].time[0], WINDOW_S).data[:, 0])
+            third = len(heading) // 3
+            if third and abs(np.median(heading[-third:]) - np.median(heading[:third])) > STILL_TURN:
+                return True
+    return False
+
+
+def _opening(stream: Stream, begin: float, seconds: float) -> Stream:
+    """Of a stream what lies within some seconds of a time."""
+    return stream.take((stream.time >= begin) & (stream.time <= begin + seconds))
+
+
+def first_heading(
+    log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], levelled: Array, gyro_bias: Array
+) -> tuple[float, str]:
+    """Yaw of the first epoch [rad], and the source that shows it.
+
+    Of what a source says in its first seconds, each sample brought back to the first epoch by the gyro, the
+    one that the others are nearest to: the median on a circle.
+
+    Parameters
+    ----------
+    log, config : the dive, and what is believed of it
+    sensors : instruments by stream
+    sources : heading sources of the log
+    levelled : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
+    gyro_bias : ndarray, shape (3,), as far as it is known [rad/s]
+
+    Raises
+    ------
+    InputError : no source speaks early enough
+    """
+    begin, means = log["imu"].time[0], {name: b.mean for name, b in beliefs(config).items()}
+    for source in by_accuracy(config, sources):
+        stream = _opening(log[source], begin, WITHIN_S)
+        if not len(stream):
+            continue
+        stream = _opening(stream, stream.time[0], WINDOW_S)
+        stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
+        imu = _opening(log["imu"], begin, stream.time[-1] - begin)
+        turned = _turned(imu.time, imu.data[:, 3:] @ mount_matrix(config.imu.mount_rpy_deg).T - gyro_bias)
+        there = levelled @ turned[imu.time.searchsorted(stream.time, "right") - 1]
+        yaws = solve_turn(sensors[source], stream.data[:, : sensors[source].model.dim], there, means)
+        apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
+        return float(yaws[int(np.argmin(apart))]), source
+    raise InputError(
+        f"{log.source}: no heading in the first {WITHIN_S:.0f} s (mag_x.., ahrs_yaw, heading or dvl_heading) and no "
+        "start.heading_deg; give start.heading_deg in the configuration"
+    )
+
+
+def _turned(time: Array, rate_b: Array) -> Array:
+    """Rotations from the body's axes at each sample of the gyro to those at the first, shape (n, 3, 3)."""
+    steps = exp_rotation(0.5 * (rate_b[1:] + rate_b[:-1]) * np.diff(time)[:, None])
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
+
+
+def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
+    """Position of the body's origin at the first epoch, in n, and its sd, shapes (3,) [m].
+
+    Parameters
+    ----------
+    log, config : the dive, and what is believed of it; a stated start goes before the log
+    R_nb : ndarray, shape (3, 3), of the first epoch
+    assumptions : to be added to, one line each
+    """
+    start, begin = config.start, log["imu"].time[0]
+    p_n = np.array([start.north_m or 0.0, start.east_m or 0.0, start.down_m or 0.0])
+    sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
+    if "fix" in log and not start.located:
+        fixes = log["fix"]
+        if len(fixes):
+            fixes = _opening(fixes, fixes.time[0], WITHIN_S)  # however late they begin: the frame is theirs
+            here, own_sd = _first_fix(fixes, config.fix.sd_m)
+            p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
+            sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
+            assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
+    elif log.origin is not None and not start.located:
+        where = f"latitude {log.origin[0]:.6f}, longitude {log.origin[1]:.6f}"
+        assumptions.append(f"start at the origin, {where}, within {sd[0]:g} m, as the log has no fix")
+    if start.down_m is None and "depth" in log:
+        depth = log["depth"]
+        first = _opening(depth, depth.time[0], WINDOW_S)
+        p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
+        sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
+    elif start.down_m is None:
+        sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
+        assumptions.append(f"start.down_m 0.0 within {sd[2]:g} m, as the log has no depth")
+    return p_n, sd
+
+
+def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
+    """The first fix, shape (2,), and its sd [m]; the line through the first ones instead of one that is far off it."""
+    own = fixes["fix_sd"][0]
+    sd = float(own) if own > 0.0 else sd
+    line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
+    off = float(np.linalg.norm(fixes.data[0, :2] - line))
+    return (line if off > AGREE_SD * (sd + FIRST_FIX_SD) else fixes.data[0, :2]), sd
+
+
+def _robust_first(time: Array, values: Array) -> float:
+    """The first of some values, by the line that half of them cannot turn; of two the first (Siegel 1982)."""
+    if len(time) < 3:
+        return float(values[0])
+    apart = np.subtract.outer(time, time)
+    rise = np.subtract.outer(values, values)
+    slopes = np.divide(rise, apart, out=np.full_like(apart, np.nan), where=apart != 0.0)  # two may share a stamp
+    slope = np.median(np.nanmedian(slopes, axis=1))
+    return float(np.median(values - slope * time) + slope * time[0])
+
+
+TILT = "vehicle_tilt"
+BOTTOM = "bottom_velocity"
+BOAT_ACC = 0.5  # noise density of a boat's acceleration: less takes its turns for those of the bottom [m/s2/rtHz]
+
+
+def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple[Log, Config]:
+    """The log and the configuration with the motion that is reckoned with; without an IMU, with `ticks` in its place.
+
+    Raises
+    ------
+    InputError : the log lacks what the motion needs, or the configuration asks for what needs an IMU
+    """
+    model = motion_model(config, log.sensors)
+    config = config.model_copy(update={"motion": config.motion.model_copy(update={"model": model})})
+    if not has_constant_velocity(config):
+        if "imu" not in log:
+            raise InputError(
+                f"{log.source}: no IMU, columns acc_x..acc_z and gyr_x..gyr_z are needed, or else roll and pitch"
+            )
+        return log, config
+    if TILT not in log:
+        raise InputError(f"{log.source}: motion.model constant_velocity needs columns roll and pitch")
+    for asked, key in _needs_imu(log, config, beliefs(config)):
+        if asked:
+            raise InputError(f"{log.source}: {key} needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z")
+    why = "the IMU is left out" if "imu" in log else "the log has no IMU"
+    config = _on_a_bed_that_may_move(log, config, assumptions)
+    motion = config.motion
+    assumptions.append(
+        f"{why}: constant velocity between measurements, walking by {motion.acc:g} m/s2/rtHz, "
+        f"and attitude by {motion.gyr:g} rad/s/rtHz (motion.acc, motion.gyr)"
+    )
+    entries = dict.fromkeys(SCALES, False) | {name: CONSIDERED for name in unseen(log.sensors)}
+    given = config.calibration
+    stated = {name for name in given.model_fields_set if "estimate" in getattr(given, name).model_fields_set}
+    calibration = given.model_copy(
+        update={
+            name: getattr(given, name).model_copy(update={"estimate": estimate})
+            for name, estimate in entries.items()
+            if name in SCALES or (getattr(given, name).estimate is True and name not in stated)
+        }
+    )
+    environment = config.environment.model_copy(update={"earth_rotation": False})
+    config = config.model_copy(update={"calibration": calibration, "environment": environment})
+    return replace(log, streams={**log.streams, "imu": ticks(log)}), config
+
+
+def _on_a_bed_that_may_move(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """A vehicle with neither IMU nor depth is a boat, and rivers move their beds: they are surveyed for that.
+
+    Nothing but position fixes would show it, so it is estimated unless the configuration says otherwise.
+    """
+    if "depth" in log or "dvl" not in log or getattr(config.calibration, BOTTOM).estimate != AUTO:
+        return config
+    bottom = getattr(config.calibration, BOTTOM).model_copy(update={"estimate": True})
+    calibration = config.calibration.model_copy(update={BOTTOM: bottom})
+    motion = config.motion
+    if "acc" not in motion.model_fields_set:
+        motion = motion.model_copy(update={"acc": BOAT_ACC})
+    assumptions.append(
+        f"no depth either, so it is a boat, under which the bed may move by {bottom.sd:g} m/s; "
+        f"calibration.{BOTTOM}: {{estimate: false}} if it rests"
+    )
+    return config.model_copy(update={"calibration": calibration, "motion": motion})
+
+
+def unseen(sensors: Collection[str]) -> list[str]:
+    """Calibration variables that a dive without an IMU does not show: against no gyro, deviation curves need fixes.
+
+    How a heading walks is a poor gyro: it would take a curve for likely that makes the vehicle turn less.
+    """
+    return [] if "fix" in sensors else [name for name in TABLE if name.endswith("_deviation")]
+
+
+def _needs_imu(log: Log, config: Config, priors: dict[str, Belief]) -> list[tuple[bool, str]]:
+    """What needs an IMU: whether it is asked for, and the key that asks."""
+    estimated = [
+        name for name in (*SCALES, *(n for n in priors if n.endswith("_time_offset"))) if priors[name].estimate
+    ]
+    return [
+        (config.graph.hydrodynamics, "graph.hydrodynamics"),
+        (
+            "mag" in heading_sources(config, log.sensors) and config.environment.dip_deg is None,
+            "environment.dip_deg: null, as the heading is a magnetometer's,",
+        ),
+        *((True, f"calibration.{name}: {{estimate: true}}") for name in estimated),
+    ]
+
+
+def first_tilt(log: Log) -> tuple[float, float]:
+    """Roll and pitch that the vehicle gives in the first seconds, the median [rad]."""
+    tilt = log[TILT]
+    roll, pitch = np.median(tilt.data[tilt.time <= tilt.time[0] + WINDOW_S], axis=0).tolist()
+    return roll, pitch
+
+
+def no_bias() -> tuple[Array, Array]:
+    """Bias of the first keyframe and its sd, shapes (6,): there is none."""
+    return np.zeros(6), np.full(6, NO_BIAS_SD)
+
+
+STILL_GYR_SD = 3e-3  # a vehicle that looks still may turn this much [rad/s]
+MOVING_TILT_SD = np.deg2rad(5.0)
+UNKNOWN_HEADING_SD = np.deg2rad(20.0)  # the samples themselves enter as factors
+START_VELOCITY_SD = 1.0
+ENOUGH_SAMPLES = 100
+
+
+def refusal(log: Log, config: Config) -> str:
+    """Why no estimate can begin, one line; empty where one can.
+
+    Parameters
+    ----------
+    log, config : of `initialise`
+    """
+    try:
+        initialise(log, config)
+    except InputError as error:
+        return str(error).removeprefix(f"{log.source}: ")
+    return ""
+
+
+def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> InitialConditions:
+    """Resolve everything that the configuration leaves to the log.
+
+    Parameters
+    ----------
+    log, config : the dive, or its first seconds
+    expected : streams that may still come, beside those of the log
+
+    Raises
+    ------
+    InputError : neither an IMU nor roll and pitch; neither DVL nor fixes; no heading and no ``start.heading_deg``
+    """
+    assumptions: list[str] = []
+    log, config = with_motion_model(log, config, assumptions)
+    if "dvl" not in log and "fix" not in log:
+        raise InputError(
+            f"{log.source}: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes, one of them is needed"
+        )
+    config = _resolve_environment(log, config, assumptions)
+    config = _resolve_noise(log, config, assumptions)
+    sources, present = heading_sources(config, log.sensors), log.sensors | set(expected)
+    compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
+    config = with_priors_stated(config, compass)
+    sensors = instruments(config, config.imu.lever_arm_m)
+    elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
+    own = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
+    used = own + heading_sources(config, present) + _thrusters(log, config, expected)
+    sensors = {s: sensors[s] for s in used}
+    assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
+    resting = unchecked(config, sources, log.sensors, expected)
+    if compass:
+        assumptions.insert(0, nothing_checks(resting.pop(0), turns_show=not has_constant_velocity(config)))
+    assumptions += resting
+
+    first = level(log, config)
+    bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)
+    R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
+    if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
+        bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
+    p_n, p_sd = first_position(log, config, R_nb, assumptions)
+    rpy, start = np.rad2deg(rpy_from_matrix(R_nb)), config.start
+    filled = start.model_copy(
+        update={
+            "roll_deg": float(rpy[0]),
+            "pitch_deg": float(rpy[1]),
+            "heading_deg": float(rpy[2] % 360.0),
+            "north_m": float(p_n[0]),
+            "east_m": float(p_n[1]),
+            "down_m": float(p_n[2]),
+            "position_sd_m": float(p_sd[0]),
+            "down_sd_m": float(p_sd[2]),
+            "tilt_sd_deg": float(np.rad2deg(rpy_sd[0])),
+            "heading_sd_deg": float(np.rad2deg(rpy_sd[2])),
+        }
+    )
+    config = config.model_copy(update={"start": filled})
+    at_imu = p_n + R_nb @ np.asarray(config.imu.lever_arm_m)
+    state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
+    prior = StatePrior(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
+    return InitialConditions(config, sensors, prior, assumptions)
+
+
+def _thrusters(log: Log, config: Config, expected: Collection[str]) -> list[str]:
+    """The stream of thruster signals, where hydrodynamics are asked for and it does not come later."""
+    if not config.graph.hydrodynamics or ("thruster" in expected and "thruster" not in log):
+        return []
+    wanted = len(config.vehicle.thrusters)
+    if "thruster" not in log:
+        raise InputError(
+            f"{log.source}: graph.hydrodynamics needs thruster signals, columns thruster_1, thruster_2, ..."
+        )
+    if len(log["thruster"].columns) != wanted:
+        raise InputError(
+            f"{log.source}: {len(log['thruster'].columns)} thruster columns, vehicle.thrusters has {wanted}; "
+            "describe every thruster in the configuration"
+        )
+    return ["thruster"]
+
+
+def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Fill in the field's magnitude and dip, and the latitude."""
+    env, changes = config.environment, {}
+    if "mag" in log and "mag" in heading_sources(config, log.sensors):
+        mag = log["mag"].data
+        norm = np.linalg.norm(mag, axis=1)
+        if env.field_norm is None:
+            changes["field_norm"] = float(np.median(norm))
+            assumptions.append(f"environment.field_norm {changes['field_norm']:.4g}, the median of the log")
+        if env.dip_deg is None:
+            imu = log["imu"]
+            f = np.column_stack([np.interp(log["mag"].time, imu.time, a) for a in imu.data[:, :3].T])
+            sine = -np.sum(f * mag, axis=1) / (np.linalg.norm(f, axis=1) * norm)
+            changes["dip_deg"] = float(np.rad2deg(np.arcsin(np.clip(np.nanmedian(sine), -1.0, 1.0))))
+            assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log")
+            if not beliefs(config)["field_dip"].estimate:
+                hint = "give it, or estimate calibration.field_dip"
+                assumptions[-1] += f", and held, with the error of the levelling in it: {hint}"
+    if env.latitude_deg is None and log.origin is not None:
+        changes["latitude_deg"] = log.origin[0]
+    if env.earth_rotation and env.latitude_deg is None and log.origin is None:
+        raise InputError(
+            "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
+        )
+    return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
+
+
+def sample_density(time: Array, samples: Array) -> float:
+    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+    samples : ndarray, shape (n, 3)
+    """
+    return float(np.mean(1.4826 * np.median(np.abs(scatter(time, samples)), axis=0)))
+
+
+def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Raise the IMU's noise densities to what its samples scatter in this dive."""
+    imu, noise, changes = log["imu"], config.imu.noise, {}
+    if len(imu) < ENOUGH_SAMPLES or has_constant_velocity(config):
+        return config
+    for name, columns in (("acc", slice(0, 3)), ("gyr", slice(3, 6))):
+        seen, believed = sample_density(imu.time, imu.data[:, columns]), getattr(noise, name)
+        if seen > NOISIER * believed:
+            changes[name] = seen
+            assumptions.append(f"imu.noise.{name} {seen:.2g} instead of {believed:.2g}: the samples scatter that much")
+    if not changes:
+        return config
+    imu_section = config.imu.model_copy(update={"noise": noise.model_copy(update=changes)})
+    return config.model_copy(update={"imu": imu_section})
+
+
+def _attitude(
+    log: Log,
+    config: Config,
+    sensors: dict[str, Instrument],
+    sources: list[str],
+    first: Level,
+    gyro_bias: Array,
+    assumptions: list[str],
+) -> tuple[Array, Array]:
+    """R_nb of the first epoch and the sd of roll, pitch, yaw."""
+    start = config.start
+    stated = start.roll_deg, start.pitch_deg
+    moving = not first.quiet and not has_constant_velocity(config)
+    from_log = first_tilt(log) if has_constant_velocity(config) else level_from_force(first.force_b).tolist()
+    roll, pitch = (own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, from_log, strict=True))
+    tilt_sd = np.deg2rad(start.tilt_sd_deg)
+    if moving and (start.roll_deg is None or start.pitch_deg is None):
+        tilt_sd = max(tilt_sd, MOVING_TILT_SD)
+        assumptions.append(
+            "the log begins in motion: roll and pitch at the start are rough until the estimate refines them"
+        )
+    yaw_sd = np.deg2rad(start.heading_sd_deg)
+    if start.heading_deg is None:
+        levelled = matrix_from_rpy([roll, pitch, 0.0])
+        yaw, source = first_heading(log, config, sensors, sources, levelled, gyro_bias)
+        yaw_sd = max(yaw_sd, UNKNOWN_HEADING_SD)
+        assumptions.append(f"start.heading_deg {np.rad2deg(yaw) % 360.0:.1f}, from {source}")
+    else:
+        yaw = np.deg2rad(start.heading_deg)
+    return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, yaw_sd])
+
+
+def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, Array]:
+    """Bias of the first keyframe and its sd, shapes (6,)."""
+    gyr_sd = np.deg2rad(config.imu.gyr_bias_sd_dps)
+    bias, sd = np.zeros(6), np.repeat([config.imu.acc_bias_sd_mps2, gyr_sd], 3)
+    if first.shows_bias:
+        bias[3:] = first.rate_b
+        sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(first.seconds), STILL_GYR_SD)))
+        assumptions.append(
+            f"gyro bias from the first {first.seconds:.0f} s, in which the vehicle is assumed to be at rest"
+        )
+    return bias, sd

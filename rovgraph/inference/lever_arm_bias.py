@@ -1,0 +1,119 @@
+"""Spurious information of the DVL's arm, by the gyro's noise.
+
+A ping measures R_bs' (v + w x l) with the arm l, and the rate w is a gyro's, with an error e: errors in variables. The
+derivative by the arm has e in it, and so has the innovation, as e x l. Least squares then counts
+
+    F = sum over pings of rate_sd^2 (tr(M) 1 - M),   M = R_bs (diag(sd^2) + G G' rate_sd^2)^-1 R_bs'
+
+as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the score - F l. Without both, what is left
+is what the vehicle's own rates show: the corrected score (Nakamura 1990). Of a vehicle that hardly rolls, with an IMU
+for autopilots, nothing is left of the arm's z, however long the dive is. Noise that the estimate follows is in no
+innovation, so M is taken less by the part of a ping's information that goes into its own prediction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.optimum import NEWEST, Optimum, estimated_parts
+from rovgraph.sensors.dvl import DvlVelocity, dvl_mounting
+
+ARM = "dvl_lever_arm"
+WORTHLESS = 0.5  # share of spurious information beyond which what is left is worth little
+MOST = 0.25  # the same, up to which the arm may be estimated
+MOST_DRAWN = 5.0  # sds, up to which it may be estimated: what is taken off is right to a tenth
+MOST_DRAWN_UNCORRECTED = 1.0  # the same where nothing is taken off
+ROUNDS = 3  # each leaves of the score's error the share of spurious information
+MOST_FOLLOWED = 0.2  # part of a ping's information that goes into its own prediction
+BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: that is no noise of a gyro
+
+
+@dataclass(frozen=True)
+class SpuriousInformation:
+    """What the rate's noise adds to the arm's three components along b, each by itself.
+
+    Attributes
+    ----------
+    information : ndarray, shape (3,) [1/m^2]
+    score : ndarray, shape (3,), that it takes from them [1/m]
+    """
+
+    information: Array
+    score: Array
+
+    def share(self, sd: Array) -> Array:
+        """Of the information of least squares with an sd [m], what is spurious."""
+        return self.information * sd**2
+
+    def drawn(self, sd: Array) -> Array:
+        """By how much least squares with an sd falls short of the arm [m]."""
+        return np.asarray(np.abs(self.score) * sd**2)
+
+    def sd(self, sd: Array) -> Array:
+        """What an sd of least squares [m] is in truth; infinite where what is left is worth little."""
+        share = self.share(sd)
+        return np.asarray(np.where(share < WORTHLESS, sd / (1.0 - np.minimum(share, WORTHLESS)), np.inf))
+
+    def step(self, step: Array, sd: Array) -> Array:
+        """What a step of least squares with its sd is in truth [m]; only where `sd` is finite."""
+        return np.asarray((step + self.score * sd**2) / (1.0 - np.minimum(self.share(sd), WORTHLESS)))
+
+
+def spurious_information(best: Optimum) -> SpuriousInformation:
+    """That of the arm in a dive, F and F l of above; of the measurements that are let in, with their weights."""
+    information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
+    for sensor, block in best.blocks.items():
+        model = block.instrument.model
+        if not isinstance(model, DvlVelocity):
+            continue
+        R_bs = dvl_mounting(best.state.at(block.keyframe))
+        WR = block.W @ np.swapaxes(R_bs, 1, 2)
+        M = np.swapaxes(WR, 1, 2) @ WR
+        part = np.minimum(followed * np.diag(M.mean(axis=0)), MOST_FOLLOWED)
+        M *= np.sqrt(np.outer(1.0 - part, 1.0 - part))
+        of_one = np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3) - M
+        used = best.weights[sensor] * (block.rate_sd < BRIDGED * np.median(block.rate_sd))
+        F = np.einsum("n,nij->ij", used * block.rate_sd**2, of_one)
+        arm = np.mean(model.lever_arm_b + np.atleast_2d(best.state.calibration[ARM]), axis=0)
+        information += np.diag(F)
+        score += F @ arm
+    return SpuriousInformation(information, score)
+
+
+def _followed(best: Optimum) -> Array:
+    """Variance of the velocity along axes of b with which the estimate follows a ping, shape (3,).
+
+    A smoother has a quarter of a filter's variance of what is integrated twice from white noise, as velocity is from
+    the gyro's by tilt. Constants follow no single ping.
+    """
+    if not isinstance(best, ChainOptimum):
+        return np.zeros(3)
+    R_nb = best.state.R_nb[-1]
+    return np.asarray(0.25 * np.diag(R_nb.T @ best.newest_of_known_constants[6:9, 6:9] @ R_nb))
+
+
+def noise_moves_arm(best: Optimum, sd: Array) -> bool:
+    """Whether too much of what least squares knows of the arm is spurious, of an sd of shape (3,) [m]."""
+    spurious = spurious_information(best)
+    most = MOST_DRAWN if isinstance(best, ChainOptimum) else MOST_DRAWN_UNCORRECTED
+    return bool(((spurious.share(sd) > MOST) | (spurious.drawn(sd) > most * sd)).any())
+
+
+def with_arm_of_rates(best: Optimum) -> Optimum:
+    """The optimum with an estimated arm as the vehicle's own rates show it; considered, where these show too little.
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    if best.unknowns.walks.get(ARM) != 0.0:
+        return best
+    sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])
+    if noise_moves_arm(best, sd[estimated_parts(best)[ARM]]):
+        return best.considering([ARM])
+    if isinstance(best, ChainOptimum):
+        for _ in range(ROUNDS):
+            best = best.with_score(ARM, spurious_information(best).score)
+    return best

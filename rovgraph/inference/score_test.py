@@ -1,0 +1,98 @@
+"""What a dive says of constants that its estimate holds.
+
+A constant that is held (the DVL's scale, the tilt of its mounting, the gyro's scale, a time offset) is released
+together with what is estimated, in one Gauss-Newton step from the optimum: the Lagrange multiplier or score test
+(Rao 1948; Engle 1984). Where the configuration is right, the step over its sd is a standard normal number, so a step
+of many sds says that the constant is not what it is held at, and the step says what it is instead. Each is released by
+itself: two that move the same measurements would hide each other. Spurious information of the DVL's arm is taken off
+(`rovgraph.inference.lever_arm_bias`).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rovgraph.inference.chain import Chain
+from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.gauss_newton import Gates
+from rovgraph.inference.lever_arm_bias import ARM, spurious_information
+from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.widened_chain import widened
+from rovgraph.model.state import PLACE
+from rovgraph.problem.initial_conditions import InitialConditions
+
+WIDE = 100.0  # times the prior sd: what is released is free
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """A constant that was released.
+
+    Attributes
+    ----------
+    name, label : of the calibration variable, and of its component
+    step, sd : from where it is held to where the measurements would have it, and its sd [unit of the variable]
+    """
+
+    name: str
+    label: str
+    step: float
+    sd: float
+
+    @property
+    def significance(self) -> float:
+        """The step in its sds, positive."""
+        return abs(self.step) / self.sd
+
+
+def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
+    """A dive as `score_test` takes it: itself, or where places were seen, its chain without them about the same point.
+
+    The step of a constant is then what all other measurements say of it.
+    """
+    if isinstance(best, ChainOptimum):
+        return best
+    gates = {sensor: gate for sensor, gate in best.solution.gates.items() if sensor != PLACE}
+    chain = Chain(best.problem.without(PLACE), initial, best.beliefs, best.unknowns)
+    return ChainOptimum(chain, replace(best.solution, point=best.state, gates=gates))
+
+
+def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None) -> list[ScoreTest]:
+    """Each component of some constants that are held, released by itself.
+
+    Parameters
+    ----------
+    best : the optimum
+    names : calibration variables; those that are estimated, or whose sensor is not in use, are passed over
+    """
+    used, beliefs = {*best.chain.blocks, "imu"}, dict(best.beliefs)
+    held = [n for n in names if n not in best.unknowns.estimated and used & set(beliefs[n].variable.sensors)]
+    for name in held:
+        own = beliefs[name]
+        beliefs[name] = replace(own, estimate=True, sd=WIDE * own.variable.sd, walk=0.0)
+    released = widened(best.chain, best.state, tuple(held), beliefs)
+    root = released.eliminate(best.state, best.solution.gates if gates is None else gates, kept=1)
+    R, z = root.border[:, :-1], root.border[:, -1]
+    information, score = R.T @ R, R.T @ z
+    kept = [released.layout.places[name] for name in best.unknowns.estimated]
+    always = np.concatenate([np.empty(0, np.int64), *(np.r_[part] for border, part in kept if border)])
+    out = []
+    for name in held:
+        for label, component in zip(beliefs[name].variable.labels, np.r_[released.layout.places[name][1]], strict=True):
+            chosen = np.append(always, component)
+            P = np.linalg.inv(information[np.ix_(chosen, chosen)])
+            out.append(ScoreTest(name, label, float(P[-1] @ score[chosen]), float(np.sqrt(P[-1, -1]))))
+    return _without_rate_noise(best, out)
+
+
+def _without_rate_noise(best: ChainOptimum, released: list[ScoreTest]) -> list[ScoreTest]:
+    """The DVL's arm without spurious information; left out where little else is known of it."""
+    arm = [one for one in released if one.name == ARM]
+    if not arm:
+        return released
+    step, sd = np.array([(one.step, one.sd) for one in arm]).T
+    spurious = spurious_information(best)
+    steps, sds = spurious.step(step, sd), spurious.sd(sd)
+    shown = [replace(one, step=float(a), sd=float(b)) for one, a, b in zip(arm, steps, sds, strict=True) if b < np.inf]
+    return [one for one in released if one.name != ARM] + shown

@@ -1,0 +1,304 @@
+"""A trajectory with its uncertainty, and its files.
+
+CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
+v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
+Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for
+tools such as ``evo_ape``.
+"""
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from rovgraph.dates import YEAR_FIRST, DateRules, is_unix
+from rovgraph.errors import InputError, as_path, warn
+from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
+from rovgraph.log import tables
+from rovgraph.log.csv_writer import write_csv
+
+FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
+TUM = ".ned.tum"  # end of the name of a TUM file, which says its frame
+TUM_FRAME = "time [s], position in north, east, down [m], quaternion x y z w from forward, starboard, down to those"
+POSITION = ["north", "east", "down"]
+ATTITUDE = ["roll", "pitch", "yaw"]
+VELOCITY = ["v_north", "v_east", "v_down"]
+COLUMNS = ["time", *POSITION, *ATTITUDE, *VELOCITY]
+
+
+@dataclass(frozen=True, repr=False)
+class Trajectory:
+    """Poses and velocities of the body's origin at n epochs.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,) [s], increasing
+    p_n, v_n : ndarray, shape (n, 3) [m, m/s]
+    R_nb : ndarray, shape (n, 3, 3)
+    cov_p, cov_v, cov_theta : ndarray, shape (n, 3, 3), of position, velocity and of a
+        small rotation, all in n [m^2, m^2/s^2, rad^2]; NaN where unknown
+    """
+
+    time: Array
+    p_n: Array
+    R_nb: Array
+    v_n: Array
+    cov_p: Array
+    cov_theta: Array
+    cov_v: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        span = f", {self.time[0]:.1f} to {self.time[-1]:.1f} s" if len(self) else ""
+        return f"<Trajectory of {len(self)} epochs{span}>"
+
+    @staticmethod
+    def certain(time: Array, p_n: Array, R_nb: Array, v_n: Array) -> "Trajectory":
+        """A trajectory without uncertainty, such as a simulator's truth."""
+        unknown = np.full((len(time), 3, 3), np.nan)
+        return Trajectory(time, p_n, R_nb, v_n, unknown, unknown, unknown)
+
+    @property
+    def position(self) -> Array:
+        """North, east, down [m], shape (n, 3): ``p_n``."""
+        return self.p_n
+
+    @property
+    def velocity(self) -> Array:
+        """Over ground, north, east, down [m/s], shape (n, 3): ``v_n``."""
+        return self.v_n
+
+    @property
+    def covariance(self) -> Array:
+        """Of the position, north, east, down [m^2], shape (n, 3, 3): ``cov_p``."""
+        return self.cov_p
+
+    @property
+    def rpy(self) -> Array:
+        """Roll, pitch, yaw [rad], shape (n, 3); a copy, so that it may be changed."""
+        return self._rpy.copy()
+
+    @cached_property
+    def _rpy(self) -> Array:
+        return rpy_from_matrix(self.R_nb)
+
+    @property
+    def rpy_sd(self) -> Array:
+        """Standard deviation of roll, pitch, yaw [rad], shape (n, 3)."""
+        J = rpy_jacobian(self._rpy)
+        return _sd(J @ self.cov_theta @ transpose(J))
+
+    @property
+    def p_sd(self) -> Array:
+        """Standard deviation of north, east, down [m], shape (n, 3)."""
+        return _sd(self.cov_p)
+
+    @property
+    def v_sd(self) -> Array:
+        """Standard deviation of the velocity [m/s], shape (n, 3)."""
+        return _sd(self.cov_v)
+
+    @property
+    def distance(self) -> float:
+        """Length of the track over ground [m]."""
+        return float(np.linalg.norm(np.diff(self.p_n, axis=0), axis=1).sum())
+
+    def every(self, step: int) -> "Trajectory":
+        """Every ``step``-th epoch and the last one."""
+        return self.take(np.unique(np.append(np.arange(0, len(self), step), len(self) - 1)))
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
+        """Some of its epochs, by index or by mask."""
+        return Trajectory(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def at(self, time: Array) -> "Trajectory":
+        """Interpolated to ``time`` (linear; rotations along the shortest arc).
+
+        Epochs outside the trajectory are clamped to its ends. Between epochs of which one
+        is not known the result is NaN.
+        """
+        t = np.clip(time, self.time[0], self.time[-1])
+
+        def linear(x: Array) -> Array:
+            flat = x.reshape(len(x), -1)
+            columns = [np.interp(t, self.time, column) for column in flat.T]
+            return np.stack(columns, axis=-1).reshape(len(t), *x.shape[1:])
+
+        R_nb = _slerp(self.time, self.R_nb, t)
+        covariances = linear(self.cov_p), linear(self.cov_theta), linear(self.cov_v)
+        return Trajectory(np.asarray(time, float), linear(self.p_n), R_nb, linear(self.v_n), *covariances)
+
+    def columns(self) -> dict[str, Array]:
+        """The columns of the contract, each of shape (n,)."""
+        values, sds = (self.p_n, self._rpy, self.v_n), (self.p_sd, self.rpy_sd, self.v_sd)
+        known = dict(zip(COLUMNS[1:], np.concatenate(values, axis=1).T, strict=True))
+        known |= zip([f"{name}_sd" for name in COLUMNS[1:]], np.concatenate(sds, axis=1).T, strict=True)
+        return {"time": self.time, **known, "cov_north_east": self.cov_p[:, 0, 1]}
+
+    def to_frame(self) -> pd.DataFrame:
+        """The columns of the contract, one row per epoch."""
+        return pd.DataFrame(self.columns())
+
+    def geodetic(self, origin: tuple[float, float]) -> tuple[Array, Array]:
+        """Latitude and longitude [deg], each of shape (n,).
+
+        Parameters
+        ----------
+        origin : latitude and longitude [deg] of north = east = 0
+        """
+        from pymap3d import ned2geodetic
+
+        lat, lon, _ = ned2geodetic(self.p_n[:, 0], self.p_n[:, 1], 0.0, *origin, 0.0)
+        return lat, lon
+
+    def write_csv(
+        self,
+        path: Path | str,
+        more: bool = False,
+        origin: tuple[float, float] | None = None,
+        unix: bool | None = None,
+    ) -> None:
+        """Write the columns of the contract that are known; time to the millisecond's tenth.
+
+        Parameters
+        ----------
+        path : the file
+        more : rows for the end of a file that has the same columns
+        origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
+        unix : whether there is a column ``unix_time``, empty for other times; None = if the time is Unix time
+        """
+        rounded = {name: np.round(own, 12) + 0.0 for name, own in self.columns().items()}  # no -0
+        known = {name: own for name, own in rounded.items() if not np.isnan(own).all()}
+        decimals = {"time": 4}
+        far = [name for name in POSITION if name in known and np.abs(known[name]).max() >= FAR]  # none where one is NaN
+        decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
+        dated = is_unix(self.time)
+        if unix or (unix is None and dated):
+            known["unix_time"] = known["time"] if dated else np.full(len(self), np.nan)
+            decimals |= {"unix_time": 4} if dated else {}
+        if origin is not None:
+            known["lat"], known["lon"] = self.geodetic(origin)
+            decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
+        write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
+
+    def write_tum(self, path: Path | str) -> None:
+        """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
+        rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
+        line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
+        poses = line * len(rows) % tuple(rows.ravel().tolist())
+        as_path(path, "path").write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
+
+
+def _sd(covariance: Array) -> Array:
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
+def _slerp(time: Array, R: Array, at: Array) -> Array:
+    """Rotations interpolated along the shortest arc; NaN beside a NaN.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,), increasing
+    R : ndarray, shape (n, 3, 3)
+    at : ndarray, shape (m,), within ``time``
+
+    Returns
+    -------
+    ndarray, shape (m, 3, 3)
+    """
+    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
+    if known.all() and len(time) > 1:
+        from scipy.spatial.transform import Rotation, Slerp  # loads half of scipy, which the smoother does not need
+
+        return np.asarray(Slerp(time, Rotation.from_matrix(R))(at).as_matrix())
+    filled = _slerp(time, np.where(known[:, None, None], R, np.eye(3)), at) if len(time) > 1 else R[[0] * len(at)]
+    gap = np.interp(at, time, np.where(known, 0.0, 1.0))
+    filled[gap > 0.0] = np.nan
+    return filled
+
+
+def read_trajectory(path: Path | str) -> Trajectory:
+    """Read a trajectory CSV: ``time, north, east``, the rest optional.
+
+    Columns that are missing are NaN in the result (rotations too), so that what a
+    file does not know cannot be mistaken for a zero.
+
+    Raises
+    ------
+    InputError : no such file, no CSV, a required column missing, time not increasing
+    """
+    return parse_trajectory(read_table(path), str(path))
+
+
+def read_table(path: Path | str) -> pd.DataFrame:
+    """The columns of a trajectory file as numbers, other columns left out.
+
+    Raises
+    ------
+    InputError : no such file, no CSV, a required column missing, something that is no number
+    """
+    path = as_path(path, "trajectory")
+    if path.is_dir():
+        likely = ("trajectory_s*.csv", "trajectory_*.csv", "truth.csv*", "reference.csv*")
+        inside = [found for pattern in likely for found in sorted(path.glob(pattern))]
+        such = f", such as {inside[0]}" if inside else ""
+        raise InputError(f"{path}: is a directory, expected a CSV file; give one in it{such}")
+    table = tables.read_table(path)
+    missing = [c for c in ("time", "north", "east") if c not in table.names]
+    if missing:
+        raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")
+    wanted = [*COLUMNS, *(c + "_sd" for c in COLUMNS[1:]), "cov_north_east"]
+    time, how = table.times("time", DateRules(remedy=YEAR_FIRST))
+    table.warn_how(how)
+    values = {c: time if c == "time" else table.numbers(c) for c in wanted if c in table.names}
+    return pd.DataFrame({c: np.where(np.isfinite(column), column, np.nan) for c, column in values.items()})
+
+
+def parse_trajectory(table: pd.DataFrame, source: str) -> Trajectory:
+    """A trajectory from a table of its columns; ``source`` names it in messages.
+
+    Rows without time, north or east are left out with a `DataWarning`.
+
+    Raises
+    ------
+    InputError : fewer than two rows, time not increasing
+    """
+    frame = table.dropna(subset=["time", "north", "east"])
+    if len(frame) < 2:
+        raise InputError(f"{source}: {len(frame)} rows with time, north and east, at least 2 are needed")
+    if len(frame) < len(table):
+        count = len(table) - len(frame)
+        warn(f"{source}: {count} rows without time, north or east were left out")
+    time = frame["time"].to_numpy(dtype=float)
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        line = int(frame.index[back[0] + 1]) + 2
+        raise InputError(f"{source} line {line}: time does not increase at {time[back[0] + 1]:.3f} s; sort the file")
+
+    def take(names: list[str]) -> Array:
+        return np.column_stack([frame[c] if c in frame else np.full(len(frame), np.nan) for c in names])
+
+    def diagonal(names: list[str]) -> Array:
+        return np.asarray(np.eye(3) * take([c + "_sd" for c in names])[:, None, :] ** 2)
+
+    rpy, cov_p = take(ATTITUDE), diagonal(POSITION)
+    if "cov_north_east" in frame:
+        cov_p[:, 0, 1] = cov_p[:, 1, 0] = frame["cov_north_east"]
+    axes = _rpy_axes(rpy)
+    cov_theta = axes @ diagonal(ATTITUDE) @ transpose(axes)
+    R_nb = matrix_from_rpy(rpy)
+    return Trajectory(time, take(POSITION), R_nb, take(VELOCITY), cov_p, cov_theta, diagonal(VELOCITY))
+
+
+def _rpy_axes(rpy: Array) -> Array:
+    """The inverse of `rpy_jacobian`: axes in n that roll, pitch and yaw turn about, as columns."""
+    cp, sp = np.cos(rpy[:, 1]), np.sin(rpy[:, 1])
+    cy, sy = np.cos(rpy[:, 2]), np.sin(rpy[:, 2])
+    zero, one = np.zeros_like(cy), np.ones_like(cy)
+    axes = [[cp * cy, cp * sy, -sp], [-sy, cy, zero], [zero, zero, one]]
+    return np.moveaxis(np.array(axes), -1, 0).swapaxes(-1, -2)

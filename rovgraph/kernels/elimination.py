@@ -1,0 +1,227 @@
+"""A dive's factors at a point: linearised and eliminated in one pass, or what they cost.
+
+The rows of `rovgraph.kernels.chain`, a keyframe at a time: motions of `rovgraph.kernels.motion_residual`, measurements
+of `rovgraph.kernels.linearization`, and the walks of calibration. What no kernel knows, as priors and the measurements
+of sensors from outside, comes as rows. Nothing but what is eliminated is kept for the whole dive.
+
+A chain whose rows are at hand, eliminated: for studies of the solver; `rovgraph.kernels.elimination` makes them itself.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rovgraph.kernels.chain import (
+    Elimination,
+    PlacedRows,
+    Room,
+    Walks,
+    absorb,
+    close_border,
+    load_measurements,
+    load_motion,
+    make_room,
+    pass_on,
+)
+from rovgraph.kernels.compile import Flags, Index, Matrices, Matrix, Vector, kernel, view_helper
+from rovgraph.kernels.layout import ACC_SCALE, MOTION
+from rovgraph.kernels.linearization import (
+    LinearizationScratch,
+    linearize_measurement,
+    make_scratch,
+    pick,
+    squared_length,
+)
+from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST, MeasuredRows
+from rovgraph.kernels.motion_residual import make_residual_scratch, motion_error, whiten_motion
+from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
+from rovgraph.kernels.states import States, epoch, with_bias
+from rovgraph.kernels.weighting import loss_weight, robust_cost
+
+
+class DiveFactors(NamedTuple):
+    """What is constant of a dive of n keyframes.
+
+    Attributes
+    ----------
+    motions, W : shapes (n - 1, ROW), (n - 1, 15, 15), of `rovgraph.kernels.motion_row`, square-root information
+    scales : shape (n - 1, 6, 6), bias by the IMU's scales in each interval, or (0, 6, 6) where these are exact
+    measured : m measurements in the order of keyframes
+    first : shape (n + 1,), a keyframe's first measurement
+    sensors : a row for each sensor, of `rovgraph.kernels.measurement_row`; those that are `GIVEN` are left out
+    gravity : [m/s^2]
+    """
+
+    motions: Matrix
+    W: Matrices
+    scales: Matrices
+    measured: MeasuredRows
+    first: Index
+    sensors: Matrix
+    gravity: float
+
+
+@view_helper
+def load_linearized(
+    k: int,
+    row: int,
+    point: States,
+    dive: DiveFactors,
+    entered: Flags,
+    room: Room,
+    scratch: LinearizationScratch,
+    r: Vector,
+) -> int:
+    """Weighted rows of the measurements of keyframe k into V from ``row`` on; returns the row after them."""
+    state, which, sensors = epoch(point, k), dive.measured.which, dive.sensors
+    V, sums, last = room.V, room.scale, len(room.scale)
+    for m in range(dive.first[k], dive.first[k + 1]):
+        sensor = sensors[which[m]]
+        if not entered[m] or sensor[KIND] == GIVEN:
+            continue
+        dim = int(sensor[DIM])
+        for a in range(dim):
+            r[a] = 0.0
+            for j in range(V.shape[1]):
+                V[row + a, j] = 0.0
+        one = pick(dive.measured, m, sensors, scratch)
+        square = linearize_measurement(state, one, dive.gravity, scratch, r, V[row : row + dim])
+        root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
+        for a in range(dim):
+            for j in range(last):
+                V[row + a, j] *= root
+                sums[j] += V[row + a, j] * V[row + a, j]
+            V[row + a, last] = root * r[a]
+        row += dim
+    return row
+
+
+@kernel()
+def eliminate_dive(
+    dive: DiveFactors,
+    entered: Flags,
+    point: States,
+    column: Index,
+    walks: Walks,
+    given: PlacedRows,
+    border_rows: Matrix,
+    out: Elimination,
+) -> int:
+    """Linearise all factors at a point and eliminate them, as `rovgraph.kernels.elimination.eliminate`.
+
+    Parameters
+    ----------
+    entered : shape (m,), measurements that are let in
+    column : shape (15 + C,), target of each component of state and calibration, -1 where it is not estimated
+    given : of what no kernel knows
+    border_rows : as `rovgraph.kernels.elimination.eliminate`
+    out : of fewer conditionals than keyframes the last one is that of the last keyframe
+    """
+    b, c = point.b, point.c
+    scales, first, given_first = dive.scales, dive.first, given.first
+    n, d, size = len(b), out.conditionals.shape[1], c.shape[1]
+    most, of_c, of_scale = 0, len(c) > 1, len(scales) > 0
+    for k in range(n):
+        most = max(most, given_first[k + 1] - given_first[k] + MOST * (first[k + 1] - first[k]))
+    room, last, stop = make_room(d, len(out.border), most, border_rows), len(out.border) + len(border_rows), 0
+    scratch, own = make_scratch(size, column), np.empty(MOST)
+    moving, unwhitened, A = make_residual_scratch(), np.empty((MOTION, WIDTH)), np.empty((MOTION, WIDTH))
+    C, targets, bias = np.zeros((MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
+    for i in range(len(targets)):
+        targets[i] = column[MOTION + ACC_SCALE + i]
+    out.left[0], dense = 0.0, 0
+    for k in range(n):
+        end = load_measurements(k, given, MOTION, d, room)
+        end = load_linearized(k, end, point, dive, entered, room, scratch, own)
+        last, stop, failing = absorb(k, n, end, last, stop, room, out)
+        if k < n - 1:
+            for i in range(6):
+                shift = 0.0
+                for j in range(len(targets)):
+                    shift += scales[k, i, j] * c[(k + 1) * of_c, ACC_SCALE + j]
+                bias[0, i], bias[1, i] = b[k, i] + shift, b[k + 1, i] + shift
+            before, after = with_bias(epoch(point, k), bias[0]), with_bias(epoch(point, k + 1), bias[1])
+            motion_error(dive.motions[k], before, after, unwhitened, moving)
+            whiten_motion(dive.W[k], unwhitened, A)
+            for i in range(MOTION):
+                A[i, RESIDUAL] = -A[i, RESIDUAL]
+                for j in range(len(targets)):
+                    C[i, j] = 0.0
+                    for m in range(6):  # of both biases alike, which leaves the walk of the bias out of it
+                        C[i, j] += (A[i, 9 + m] + A[i, AFTER + 9 + m]) * scales[k, m, j]
+            dense = load_motion(A, C, targets, walks.weight[k], walks.kept[k], walks.r[k], room)
+        failing = max(failing, pass_on(k, n, dense, room, out.conditionals))
+        if failing >= 0:
+            return failing
+    return close_border(n, d, room, out.border)
+
+
+@kernel()
+def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> None:
+    """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 of those that are `GIVEN`."""
+    first, sensors, which = dive.first, dive.sensors, dive.measured.which
+    scratch = make_scratch(point.c.shape[1], np.empty(0, np.int64))
+    for k in range(len(first) - 1):
+        state = epoch(point, k)
+        for m in range(first[k], first[k + 1]):
+            square_out[m] = 0.0
+            if sensors[which[m], KIND] != GIVEN:
+                square_out[m] = squared_length(state, pick(dive.measured, m, sensors, scratch), dive.gravity, scratch)
+
+
+@kernel()
+def robust_costs(square: Vector, which: Index, sensors: Matrix, entered: Flags) -> float:
+    """Sum of the robust costs of measurements of some squared lengths, of those that are let in."""
+    total = 0.0
+    for m in range(len(square)):
+        if entered[m]:
+            sensor = sensors[which[m]]
+            total += robust_cost(square[m], int(sensor[LOSS]), sensor[BEND])
+    return total
+
+
+class LinearMotions(NamedTuple):
+    """Whitened rows of n - 1 motions.
+
+    Attributes
+    ----------
+    A : shape (n - 1, s, 2 (s + 1)), columns of the keyframe before, right-hand side, columns of the keyframe after,
+        and one that is not read
+    C, targets : shapes (n - 1, s, e) and (e,), other columns, of the keyframe before or of the border
+    """
+
+    A: Matrices
+    C: Matrices
+    targets: Index
+
+
+@kernel()
+def eliminate(motions: LinearMotions, walks: Walks, measured: PlacedRows, border_rows: Matrix, out: Elimination) -> int:
+    """Eliminate n keyframes in the order of time, then the border.
+
+    Parameters
+    ----------
+    walks : of the last d - s components
+    border_rows : shape (p, c + 1), of the border's priors with their right-hand sides
+
+    Returns
+    -------
+    -1, or the first component that the rows do not determine, ``k d + j`` of a keyframe and ``n d + j`` of the border
+    """
+    A, C, first = motions.A, motions.C, measured.first
+    n, d, s, c = out.conditionals.shape[0], out.conditionals.shape[1], A.shape[1], out.border.shape[0]
+    most = 0
+    for k in range(n):
+        most = max(most, first[k + 1] - first[k])
+    room, last, stop = make_room(d, c, most, border_rows), c + border_rows.shape[0], 0
+    out.left[0], dense = 0.0, 0
+    for k in range(n):
+        end = load_measurements(k, measured, s, d, room)
+        last, stop, failing = absorb(k, n, end, last, stop, room, out)
+        if k < n - 1:
+            dense = load_motion(A[k], C[k], motions.targets, walks.weight[k], walks.kept[k], walks.r[k], room)
+        failing = max(failing, pass_on(k, n, dense, room, out.conditionals))
+        if failing >= 0:
+            return failing
+    return close_border(n, d, room, out.border)

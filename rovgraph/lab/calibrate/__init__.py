@@ -1,0 +1,10 @@
+"""Calibrations made from a log of their own: the magnetometer turned by hand, sensors at rest.
+
+`calibrate_magnetometer` and `calibrate_noise` do the work of ``rovgraph calibrate``. Each returns what was
+found, and the piece of configuration that follows from it.
+"""
+
+from rovgraph.lab.calibrate.magnetometer import METHODS, MagnetometerCalibration, Method, calibrate_magnetometer
+from rovgraph.lab.calibrate.noise import NoiseReport, calibrate_noise
+
+__all__ = ["METHODS", "MagnetometerCalibration", "Method", "NoiseReport", "calibrate_magnetometer", "calibrate_noise"]

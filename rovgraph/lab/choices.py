@@ -1,0 +1,93 @@
+"""What a person gives to a study of the calibration: names, goals, what is known already."""
+
+import difflib
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.lab.plan import KnownComponents
+from rovgraph.model.calibration import TABLE
+
+
+def listed(names: str | Iterable[str] | None) -> list[str]:
+    """Names, each once, of a list or of a text with commas between them.
+
+    Raises
+    ------
+    InputError : something that is no name
+    """
+    each = names.split(",") if isinstance(names, str) else [*(names or ())]
+    if wrong := [name for name in each if not isinstance(name, str)]:
+        raise InputError(f"{wrong[0]!r}: expected a name, such as 'dvl_yaw'")
+    return list(dict.fromkeys(name.strip() for name in each if name.strip()))
+
+
+def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
+    """Label of a component -> wanted sd, radians and SI.
+
+    Parameters
+    ----------
+    wanted : such a mapping, or texts such as ``dvl_yaw=1deg`` and ``dvl_scale=0.002``
+
+    Raises
+    ------
+    InputError : no such component, no positive number, degrees for what is no angle or the reverse
+    """
+    if wanted is not None and not isinstance(wanted, Mapping | Sequence):
+        raise InputError(f"goals: {wanted!r}, expected a mapping of components to sds, or texts such as 'dvl_yaw=1deg'")
+    if not isinstance(wanted, Mapping):
+        return dict(_goal(text) for text in wanted or ())
+    for label, sd in wanted.items():
+        if not (isinstance(sd, int | float) and math.isfinite(sd) and sd > 0.0):
+            raise InputError(
+                f"goal {label}: {sd!r}, expected an sd above 0 in radians or SI, or the text '{label}=1deg'"
+            )
+    return dict(wanted)
+
+
+def _goal(text: str) -> tuple[str, float]:
+    label, _, number = text.partition("=")
+    label = label.strip()
+    variable = next((v for v in TABLE.values() if label in v.labels), None)
+    if variable is None:
+        every = [known for v in TABLE.values() for known in v.labels]
+        near = difflib.get_close_matches(label, every, 1)
+        raise InputError(f"goal {text!r}: unknown component {label!r}" + (f", did you mean {near[0]}?" if near else ""))
+    number, degrees = number.strip(), number.strip().endswith("deg")
+    try:
+        sd = float(number.removesuffix("deg"))
+    except ValueError:
+        sd = math.nan
+    if not (math.isfinite(sd) and sd > 0.0) or degrees != variable.angular:
+        raise InputError(
+            f"goal {text!r}: expected {label}=" + ("1deg" if variable.angular else f"0.01 [{variable.unit}]")
+        )
+    return label, math.radians(sd) if degrees else sd
+
+
+def read_known(path: Path) -> KnownComponents:
+    """What the ``observability.json`` of a dive says.
+
+    Raises
+    ------
+    InputError : no such file, or not one of ``rovgraph observe``
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        components = content["components"]
+        covariance = np.array(content["covariance"], float)
+        sd = np.array([components[label]["prior_sd"] for label in components], float)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{path}: no observability.json of rovgraph observe") from None
+    square = covariance.shape == (len(sd), len(sd)) and len(sd) > 0
+    if not (
+        square and np.isfinite(covariance).all() and (np.linalg.eigvalsh(covariance) > 0.0).all() and (sd > 0).all()
+    ):
+        raise InputError(f"{path}: its covariance is not valid; make the file again with rovgraph observe")
+    return KnownComponents(tuple(components), covariance, sd)

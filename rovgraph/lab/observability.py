@@ -1,0 +1,332 @@
+"""What of the calibration a dive can show: what ``rovgraph observe`` does.
+
+From the graph's own information matrix: states are marginalised exactly, by QR, and what
+noise in the estimate feigns, the spurious information, is removed (`rovgraph.inference.observability`).
+
+Directions of the calibration that a dive leaves open, and the same in words.
+
+An eigenvector of the information, in units of the prior's sd, is a combination of components
+that the data see by itself; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
+"""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.observability import (
+    UNOBSERVABLE_ABOVE,
+    data_information,
+    relative_covariance,
+    verdict,
+    without_spurious_information,
+)
+from rovgraph.inference.optimum import OTHERS, Optimum, joint_prior_sd
+from rovgraph.inference.smoother import assemble
+from rovgraph.log import Log
+from rovgraph.log.frozen import without_frozen
+from rovgraph.model.calibration import TABLE, Variable
+from rovgraph.model.config import Config
+from rovgraph.process import Progress, no_progress
+
+TIMES = 30  # at which the sd is calculated
+FEWEST_KEYFRAMES = 20
+OTHER_LABELS = (
+    "acc_bias_x", "acc_bias_y", "acc_bias_z", "gyr_bias_x", "gyr_bias_y", "gyr_bias_z",
+    "start_roll", "start_pitch", "start_heading",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What a dive shows of its calibration; c scalar components that are estimated.
+
+    Attributes
+    ----------
+    labels, variables : c, names of the components, and the rows of the table they belong to
+    prior_sd : ndarray, shape (c,), before the dive [unit of each]
+    claimed_sd : ndarray, shape (c,), after it as the graph has it, linearised at its noisy estimate
+    information : ndarray, shape (c, c), that the data add to the prior, in units of the prior's sd,
+        without spurious information
+    correlation : ndarray, shape (c, c + 9), of the components with each other, then with the last
+        bias (accelerometer, gyro; body axes) and the start's roll, pitch and heading
+    time : ndarray, shape (m,), since the start of the dive [s]
+    relative : ndarray, shape (m, c), sd given the data up to then, as a part of the prior's
+    """
+
+    labels: tuple[str, ...]
+    variables: tuple[Variable, ...]
+    prior_sd: Array
+    claimed_sd: Array
+    information: Array
+    correlation: Array
+    time: Array
+    relative: Array
+
+    @property
+    def covariance(self) -> Array:
+        """Of the calibration after the dive, shape (c, c) [units of the components]."""
+        return relative_covariance(self.information) * np.outer(self.prior_sd, self.prior_sd)
+
+    @property
+    def ratio(self) -> Array:
+        """sd after the dive over sd before, shape (c,)."""
+        return np.sqrt(np.diag(relative_covariance(self.information)))
+
+    @property
+    def sd(self) -> Array:
+        """sd after the dive, shape (c,) [unit of each]."""
+        return self.ratio * self.prior_sd
+
+    @property
+    def bits(self) -> Array:
+        """Information gained on each component, shape (c,)."""
+        return np.asarray(-np.log2(self.ratio))
+
+    @property
+    def joint_bits(self) -> float:
+        """Information gained on all of them together."""
+        return joint_bits(self.information)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Of each component: observable, weak or unobservable."""
+        return [verdict(ratio) for ratio in self.ratio.tolist()]
+
+    def of(self, labels: Sequence[str]) -> "Observability":
+        """Some of the components, in that order; the others stay as unknown as they are."""
+        kept, count = [self.labels.index(label) for label in labels], len(self.labels)
+        here = np.ix_(kept, kept)
+        return Observability(
+            tuple(labels),
+            tuple(self.variables[i] for i in kept),
+            self.prior_sd[kept],
+            self.claimed_sd[kept],
+            data_information(relative_covariance(self.information)[here], np.ones(len(kept))),
+            self.correlation[np.ix_(kept, [*kept, *range(count, self.correlation.shape[1])])],
+            self.time,
+            self.relative[:, kept],
+        )
+
+    def correlated(self, beyond: float = 0.5) -> list[tuple[str, str, float]]:
+        """Pairs with their correlation, the strongest first."""
+        names, c = (*self.labels, *OTHER_LABELS), len(self.labels)
+        pairs = [(i, j) for i in range(c) for j in range(i + 1, len(names)) if abs(self.correlation[i, j]) > beyond]
+        pairs.sort(key=lambda p: -abs(self.correlation[p]))
+        return [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
+
+
+def joint_bits(information: Array) -> float:
+    """Information gained on all components together; ``information`` in units of the prior's sd."""
+    return float(0.5 * np.linalg.slogdet(np.eye(len(information)) + information)[1] / np.log(2.0))
+
+
+def observe(log: Log, config: Config, also: Sequence[str] = (), progress: Progress = no_progress) -> Observability:
+    """What a recorded dive shows of the calibration.
+
+    Parameters
+    ----------
+    log, config : the dive, and what is believed of vehicle and sensors
+    also : calibration variables to estimate beside those of the configuration
+    progress : called now and then
+
+    Raises
+    ------
+    InputError : an unknown variable, one whose sensor is not in use, none at all; too short a log
+    """
+    config = estimating(config, also)
+    log, _ = without_frozen(log, config)
+    dive = solved(log, config, progress)
+    missing = set(also) - set(dive.unknowns.estimated)
+    if missing:
+        name = min(missing)
+        needed = " or ".join(TABLE[name].sensors)
+        raise InputError(f"{log.source}: {name} cannot be estimated, no {needed} in use; take it out of --estimate")
+    return examined(dive, config, progress=progress)
+
+
+def estimating(config: Config, also: Sequence[str]) -> Config:
+    """A configuration that estimates some variables more.
+
+    Raises
+    ------
+    InputError : an unknown variable
+    """
+    for name in also:
+        if name not in TABLE:
+            near = difflib.get_close_matches(name, TABLE, 1)
+            hint = f", did you mean {near[0]}?" if near else ""
+            raise InputError(f"unknown calibration variable {name!r}{hint} (known: {', '.join(TABLE)})")
+    entries = {name: getattr(config.calibration, name).model_copy(update={"estimate": True}) for name in also}
+    return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
+
+
+def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimum:
+    """The graph of a dive and its optimum.
+
+    Raises
+    ------
+    InputError : too short a log, nothing to estimate
+    """
+    progress("smoothing", 0.1)
+    batch = assemble(log, initialise(log, config))
+    if len(batch.problem) < FEWEST_KEYFRAMES:
+        raise InputError(
+            f"{log.source}: {len(batch.problem)} keyframes say nothing about calibration, "
+            f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
+        )
+    dive = batch.optimum()
+    # what is not estimated because noise would move it is what is to be looked at
+    moved = [name for name in dive.unknowns.considered if dive.beliefs[name].estimate]
+    dive = dive.estimating(moved) if moved else dive
+    if not dive.unknowns.estimated:
+        raise InputError(
+            f"{log.source}: no calibration variable is estimated; give --estimate, or estimate: true in calibration"
+        )
+    return dive
+
+
+def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progress = no_progress) -> Observability:
+    """What a solved dive shows of the calibration.
+
+    Parameters
+    ----------
+    dive, config : of `solved`
+    noisy : remove spurious information
+    progress : called now and then
+    """
+    progress("information", 0.6)
+    ends = np.unique(np.linspace(0, len(dive.problem) - 1, TIMES + 1).round().astype(int)[1:]).tolist()
+    known = dive.knowledge(ends)
+    before = np.array([np.concatenate(list(joint_prior_sd(dive, end).values())) for end in ends])
+    seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
+    progress("information", 0.7)
+    own = without_spurious_information(dive, ends, seen, before) if noisy else seen
+    variables = tuple(TABLE[name] for name in dive.unknowns.estimated for _ in TABLE[name].labels)
+    labels = tuple(label for name in dive.unknowns.estimated for label in TABLE[name].labels)
+    begin = float(dive.problem.time[0])
+    relative = np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))
+    return Observability(
+        labels,
+        variables,
+        before[-1],
+        np.sqrt(np.diag(known.calibration[-1])),
+        own[-1],
+        _correlation(known.covariance[-1], relative_covariance(own[-1]) * np.outer(before[-1], before[-1])),
+        dive.problem.time[ends] - begin,
+        relative * before / before[-1],
+    )
+
+
+def _correlation(joint: Array, calibration: Array) -> Array:
+    """Of the calibration with itself and with others, shape (c, c + others).
+
+    Parameters
+    ----------
+    joint : ndarray, covariance of others and calibration, as the graph has it
+    calibration : ndarray, shape (c, c), covariance without spurious information: what the others
+        depend on the calibration stays, given that
+    """
+    own, other = slice(OTHERS, None), slice(0, OTHERS)
+    slope = np.linalg.solve(joint[own, own], joint[own, other]).T
+    spread = joint[other, other] + slope @ (calibration - joint[own, own]) @ slope.T
+    both = np.concatenate([calibration, calibration @ slope.T], axis=1)
+    sd = np.sqrt(np.concatenate([np.diag(calibration), np.diag(spread)]))
+    return np.asarray(both / np.outer(sd[: len(calibration)], sd))
+
+
+TAKES_PART = 0.25  # a component's share of a direction, of the largest one's
+ALIKE = 0.15  # two changes that differ by less than this part are called the same
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Eigenvectors of the information, the weakest first.
+
+    Attributes
+    ----------
+    ratio : ndarray, shape (c,), sd along each, as a part of the prior's
+    axes : ndarray, shape (c, c), a row each, in units of the prior's sd
+    """
+
+    ratio: Array
+    axes: Array
+
+
+def directions(information: Array) -> Directions:
+    """Eigenvectors of an information matrix, shape (c, c), in units of the prior's sd."""
+    value, axes = np.linalg.eigh(information)
+    return Directions(1.0 / np.sqrt(1.0 + np.maximum(value, 0.0)), axes.T)
+
+
+def in_words(information: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> list[str]:
+    """What cannot be known, a sentence each; where all can be, the weakest direction.
+
+    Parameters
+    ----------
+    information : ndarray, shape (c, c), in units of the prior's sd
+    labels, units : c
+    prior_sd : ndarray, shape (c,)
+    """
+    alone = 1.0 / np.sqrt(1.0 + np.diag(information))  # with all others known
+    silent = np.flatnonzero(alone > UNOBSERVABLE_ABOVE).tolist()
+    sentences = [f"nothing is known of {_listed([labels[i] for i in silent])}"] if silent else []
+    heard = np.flatnonzero(alone <= UNOBSERVABLE_ABOVE).tolist()
+    if not heard:
+        return sentences
+    own = np.linalg.inv(relative_covariance(information)[np.ix_(heard, heard)]) - np.eye(len(heard))
+    found = directions(own)
+    names, kinds, sd = [labels[i] for i in heard], [units[i] for i in heard], prior_sd[heard]
+    open_ones = found.axes[found.ratio > UNOBSERVABLE_ABOVE]
+    sentences += [_combination(axis, names, kinds, sd) for axis in _apart(open_ones)]
+    if not sentences:
+        parts = [names[i] for i in _parts(found.axes[0])]
+        sentences.append(
+            f"the weakest direction is {_listed(parts)}, known to {100 * found.ratio[0]:.0f} % of the prior"
+        )
+    return sentences
+
+
+def _apart(axes: Array) -> Array:
+    """Directions, shape (k, c), that span the same as k given ones, of as few components each as elimination leaves.
+
+    Axes of nearly one eigenvalue are any mixture of each other, and would tell the same twice.
+    """
+    if len(axes) < 2:
+        return axes
+    pivots = qr(axes, mode="r", pivoting=True)[1][: len(axes)]
+    return np.asarray(np.linalg.solve(axes[:, pivots], axes))
+
+
+def _parts(axis: Array) -> list[int]:
+    """Components that take part in a direction, the largest first."""
+    order = np.argsort(-np.abs(axis))
+    return [int(i) for i in order if abs(axis[i]) > TAKES_PART * np.abs(axis).max()]
+
+
+def _combination(axis: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> str:
+    """What may change along an open direction, and what that leaves known."""
+    parts = _parts(axis)
+    names, change = [labels[i] for i in parts], axis[parts] * prior_sd[parts]
+    if len(parts) == 1:
+        return f"next to nothing is known of {names[0]}"
+    if len(parts) == 2 and units[parts[0]] == units[parts[1]]:
+        if abs(change[0] + change[1]) < ALIKE * abs(change[0]):
+            return f"only the sum of {names[0]} and {names[1]} is known"
+        if abs(change[0] - change[1]) < ALIKE * abs(change[0]):
+            return f"only the difference of {names[0]} and {names[1]} is known"
+    if len({units[i] for i in parts}) == 1 and (np.abs(np.abs(change / change[0]) - 1.0) < ALIKE).all():
+        up = [n for n, c in zip(names, change, strict=True) if c * change[0] > 0]
+        down = [n for n, c in zip(names, change, strict=True) if c * change[0] < 0]
+        against = f" against {_listed(down)}" if down else ""
+        return f"{_listed(up)} may change by the same amount{against}, and the dive would look alike"
+    return f"{_listed(names)} can stand in for each other: only combinations of them are known"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

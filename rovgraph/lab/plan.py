@@ -1,0 +1,264 @@
+"""What to drive to know the calibration: what ``rovgraph plan`` does.
+
+The information of a dive depends on where it is linearised, not on the noise that comes. So a
+manoeuvre is driven without noise by a vehicle with the believed sensors, the graph is
+linearised there, and what is known already is added.
+
+Manoeuvres to choose from: scenarios of the simulator, each at some speeds.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.lab.executors import cores, in_workers
+from rovgraph.lab.observability import Observability, examined, joint_bits, solved
+from rovgraph.log import Log
+from rovgraph.model.config import AS_WRITTEN, Config, beliefs
+from rovgraph.simulate import CALM, Path, Style, Truth, scenario, simulate
+
+CANDIDATES = ("straight", "lawnmower", "square", "circle", "figure8", "accelerate-and-stop", "spiral")
+SPEEDS = (0.25, 0.5)  # [m/s]
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """A scenario at a speed [m/s]."""
+
+    name: str
+    speed: float
+
+    def __str__(self) -> str:
+        return f"{self.name}@{self.speed:g}"
+
+
+def manoeuvres(names: Sequence[str] | None, duration: float) -> list[Manoeuvre]:
+    """Those of some names, as ``circle`` at all speeds or ``circle@0.3`` at one.
+
+    Parameters
+    ----------
+    names : None = all candidates
+    duration : that they have to fit into [s]
+
+    Raises
+    ------
+    InputError : no such scenario, no such speed, too short a duration
+    """
+    chosen: dict[Manoeuvre, None] = {}
+    for text in names or CANDIDATES:
+        name, at, speed = text.partition("@")
+        for one in (_number(speed, text),) if at else SPEEDS:
+            scenario(name, duration, one)  # refuses what cannot be
+            chosen[Manoeuvre(name, one)] = None
+    return list(chosen)
+
+
+def _number(speed: str, text: str) -> float:
+    try:
+        return float(speed)
+    except ValueError:
+        raise InputError(f"manoeuvre {text!r}: a speed in m/s is expected behind the @, as circle@0.3") from None
+
+
+IMU_HZ, DVL_HZ = (5.0, 1000.0), (0.1, 50.0)  # rates that can be planned with
+MOST_COLUMNS = 6  # of a table, where no goal says what matters
+
+
+@dataclass(frozen=True)
+class SensorRates:
+    """How often the sensors will measure.
+
+    Attributes
+    ----------
+    imu_rate, dvl_rate : [Hz]
+    fix_interval : [s], None = no position fixes
+    """
+
+    imu_rate: float = 100.0
+    dvl_rate: float = 5.6
+    fix_interval: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no sensor does.
+
+        Raises
+        ------
+        InputError : a rate or an interval out of bounds
+        """
+        for name, rate, (least, most) in (("IMU", self.imu_rate, IMU_HZ), ("DVL", self.dvl_rate, DVL_HZ)):
+            if not least <= rate <= most:
+                raise InputError(f"{name} rate of {rate:g} Hz: between {least:g} and {most:g} Hz are expected")
+        if self.fix_interval is not None and not self.fix_interval > 0.0:
+            raise InputError(f"fix interval of {self.fix_interval} s: more than 0 s is expected")
+
+
+@dataclass(frozen=True)
+class KnownComponents:
+    """What is known of some components already.
+
+    Attributes
+    ----------
+    labels : c
+    covariance : ndarray, shape (c, c), data and prior together [units of the components]
+    prior_sd : ndarray, shape (c,), of the prior in it
+    """
+
+    labels: tuple[str, ...]
+    covariance: Array
+    prior_sd: Array
+
+    @staticmethod
+    def nothing() -> "KnownComponents":
+        """No component."""
+        return KnownComponents((), np.zeros((0, 0)), np.zeros(0))
+
+    def information(self, labels: Sequence[str], sd: Array) -> Array:
+        """What its data say of some components, shape (c, c), in units of ``sd``; what it also knew is marginalised."""
+        both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in labels]
+        out = np.zeros((len(labels), len(labels)))
+        if both:
+            there, here = (np.array(column) for column in zip(*both, strict=True))
+            own = np.linalg.inv(self.covariance[np.ix_(here, here)]) - np.diag(self.prior_sd[here] ** -2)
+            out[np.ix_(there, there)] = own * np.outer(sd[there], sd[there])
+        return out
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a manoeuvre would show.
+
+    Attributes
+    ----------
+    manoeuvre : which
+    sd : ndarray, shape (c,), after it, with what is known before [unit of each]
+    bits : information it adds
+    """
+
+    manoeuvre: Manoeuvre
+    sd: Array
+    bits: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Manoeuvres, the best first.
+
+    Attributes
+    ----------
+    labels, units : c, of the calibration
+    before : ndarray, shape (c,), sd as known before [unit of each]
+    goals : label -> sd that is wanted [its unit]
+    ranked : predictions
+    scores : of each, largest sd over its goal; without goals minus the bits
+    duration : of each manoeuvre [s]
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    before: Array
+    goals: dict[str, float]
+    ranked: list[Prediction]
+    scores: list[float]
+    duration: float
+
+    @property
+    def selected(self) -> list[int]:
+        """Components worth a column: those of the goals, else those that the best manoeuvre shows most of."""
+        if self.goals:
+            return [self.labels.index(name) for name in self.goals]
+        return sorted(np.argsort(self.ranked[0].sd / self.before)[:MOST_COLUMNS].tolist())
+
+    def path(self) -> Path:
+        """That of the best manoeuvre."""
+        best = self.ranked[0].manoeuvre
+        return path_of(best, self.duration)
+
+
+def plan(
+    config: Config,
+    candidates: Sequence[Manoeuvre],
+    duration: float,
+    known: KnownComponents | None = None,
+    goals: Mapping[str, float] | None = None,
+    sensors: SensorRates | None = None,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Plan:
+    """Rank manoeuvres by what they would show of the calibration.
+
+    Parameters
+    ----------
+    config : what is believed of vehicle and sensors, and what is to be estimated
+    candidates : the manoeuvres
+    duration : of each [s]
+    known : from dives before
+    goals : label -> sd that is wanted [its unit]
+    sensors : how often they measure
+    progress : called with the share that is done
+
+    Raises
+    ------
+    InputError : no manoeuvre, nothing to estimate, a goal for what is not estimated
+    """
+    if not candidates:
+        raise InputError("no manoeuvres to choose from; give --manoeuvres")
+    goals, known = dict(goals or {}), known or KnownComponents.nothing()
+    _check(goals, [label for b in beliefs(config).values() if b.estimate for label in b.variable.labels])
+    work = partial(predicted, config=config, duration=duration, sensors=sensors or SensorRates())
+    each = in_workers(work, candidates, min(cores(), len(candidates)), progress)
+    # what is considered is estimated where a manoeuvre shows it, which others may not do
+    labels = tuple(label for label in each[0].labels if all(label in one.labels for one in each))
+    seen = [one.of(labels) for one in each]
+    _check(goals, labels)
+    already = known.information(labels, seen[0].prior_sd)
+    predictions = [_with(already, one, candidate) for one, candidate in zip(seen, candidates, strict=True)]
+    wanted = {labels.index(name): sd for name, sd in goals.items()}
+    score = [max(p.sd[i] / sd for i, sd in wanted.items()) if wanted else -p.bits for p in predictions]
+    order = np.argsort(score, kind="stable").tolist()
+    return Plan(
+        labels,
+        tuple(v.unit for v in seen[0].variables),
+        _sd(already, seen[0].prior_sd),
+        goals,
+        [predictions[i] for i in order],
+        [float(score[i]) for i in order],
+        duration,
+    )
+
+
+def _check(goals: Mapping[str, float], estimated: Sequence[str]) -> None:
+    """Refuse a goal for what is not estimated."""
+    for name in goals:
+        if name not in estimated:
+            raise InputError(f"goal {name}: it is not estimated (estimated: {', '.join(estimated)}); give --estimate")
+
+
+def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
+    """A manoeuvre in calm water: what waves would teach nobody can promise."""
+    return scenario(manoeuvre.name, duration, manoeuvre.speed, Style(waves=CALM))
+
+
+def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
+    """What a manoeuvre would show by itself."""
+    ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
+    own = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
+    truth = Truth(
+        own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
+        fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
+    )  # fmt: skip
+    dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
+    log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
+    return examined(solved(log, own), own, noisy=False)
+
+
+def _with(already: Array, seen: Observability, manoeuvre: Manoeuvre) -> Prediction:
+    together = already + seen.information
+    return Prediction(manoeuvre, _sd(together, seen.prior_sd), joint_bits(together) - joint_bits(already))
+
+
+def _sd(information: Array, prior_sd: Array) -> Array:
+    """sd after information in units of the prior's sd."""
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.eye(len(prior_sd)) + information))) * prior_sd)

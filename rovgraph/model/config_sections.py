@@ -1,0 +1,377 @@
+"""The sections of the configuration, and what may stand in them."""
+
+import datetime as dt
+from functools import partial
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from rovgraph.dates import DateRules
+from rovgraph.model.presets import known_preset
+
+Positive = Annotated[float, Field(gt=0)]
+Readmission = Annotated[
+    float,
+    Field(gt=0, description="after this long a rejected sensor is used again; a filter first inflates its covariance"),
+]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+NotNegative = Annotated[float, Field(ge=0)]
+Triple = tuple[float, float, float]
+PositiveTriple = tuple[Positive, Positive, Positive]
+NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
+Loss = Literal["none", "huber", "cauchy"]
+STAMPED = (
+    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *("depth", "fix", "place", "thruster"),
+)
+HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
+ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
+DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
+
+
+class ConfigSection(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+
+
+class StartSettings(ConfigSection):
+    """Where the dive starts; null = from the log."""
+
+    north_m: float | None = Field(None, description="north of the first epoch; null = 0 beside east_m, else first fix")
+    east_m: float | None = Field(None, description="east of the first epoch; null = 0 beside north_m, else first fix")
+    down_m: float | None = Field(None, description="depth of the first epoch; null = first depth sample, else 0")
+    heading_deg: float | None = Field(None, description="heading; null = first heading samples")
+    roll_deg: float | None = Field(None, description="roll; null = gravity")
+    pitch_deg: float | None = Field(None, description="pitch; null = gravity")
+    position_sd_m: Positive = Field(0.1, description="sd of the start's north and east")
+    down_sd_m: Positive | None = Field(None, description="sd of the start's down; null = position_sd_m")
+    heading_sd_deg: Positive = Field(5.0, description="sd of the start's heading")
+    tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, for a start at rest")
+
+    @property
+    def located(self) -> bool:
+        """Whether north or east is stated."""
+        return self.north_m is not None or self.east_m is not None
+
+
+class Environment(ConfigSection):
+    """Gravity, magnetic field and Earth rate."""
+
+    gravity_mps2: Positive = Field(9.81, description="gravity")
+    origin_lat_deg: Latitude | None = Field(
+        None, description="latitude of north = east = 0; null = of the first fix_lat, where there is one"
+    )
+    origin_lon_deg: Annotated[float, Field(ge=-180, le=360)] | None = Field(
+        None, description="longitude of north = east = 0, east positive"
+    )
+    latitude_deg: Latitude | None = Field(None, description="latitude, for Earth rotation; null = of the origin")
+    declination_deg: float = Field(0.0, description="magnetic declination, east positive")
+    field_norm: Positive | None = Field(
+        None, description="magnitude of the field, log's unit; null = median of the log"
+    )
+    dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
+        None, description="dip of the field, down positive; null = from the log, against gravity"
+    )
+    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros measure")
+
+    @model_validator(mode="after")
+    def _whole_origin(self) -> Self:
+        if (self.origin_lat_deg is None) != (self.origin_lon_deg is None):
+            raise PydanticCustomError("half", "expected both origin_lat_deg and origin_lon_deg, or neither")
+        return self
+
+    @property
+    def origin(self) -> tuple[float, float] | None:
+        """Latitude and longitude [deg] of north = east = 0, where they are stated."""
+        lat, lon = self.origin_lat_deg, self.origin_lon_deg
+        return None if lat is None or lon is None else (lat, lon)
+
+
+class ImuNoise(ConfigSection):
+    """Noise densities, per root hertz."""
+
+    acc: Positive = Field(8.0e-4, description="accelerometer [m/s2/rtHz]")
+    gyr: Positive = Field(6.9e-4, description="gyro [rad/s/rtHz]")
+    acc_walk: Positive = Field(3.0e-4, description="random walk of the accelerometer's bias [m/s2/rts]")
+    gyr_walk: Positive = Field(1.0e-5, description="random walk of the gyro's bias [rad/s/rts]")
+
+
+class Mag(ConfigSection):
+    """The magnetometer's calibration, (3.2) with a full matrix: field = matrix (sample - centre)."""
+
+    centre: Triple = Field((0.0, 0.0, 0.0), description="hard iron, IMU axes, log's unit; subtracted from every sample")
+    matrix: tuple[Triple, Triple, Triple] = Field(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="soft iron and scale: factor of (sample - centre)",
+    )
+
+    @field_validator("matrix")
+    @classmethod
+    def _not_flat(cls, matrix: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+        values = np.linalg.svd(np.array(matrix), compute_uv=False)
+        if values[-1] < 0.01 * values[0]:
+            raise PydanticCustomError("singular", "expected a multiple of the unit matrix, or near it; it is singular")
+        return matrix
+
+    def calibrated(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The field of magnetometer samples, shape (n, 3), IMU axes."""
+        return np.asarray((samples - np.array(self.centre)) @ np.array(self.matrix).T)
+
+
+class Imu(ConfigSection):
+    """Inertial unit: mounting and noise."""
+
+    preset: ImuPreset | None = Field(
+        None, description="instrument whose data sheet fills in missing keys, see docs/presets.md"
+    )
+    mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
+    noise: ImuNoise = ImuNoise()
+    mag: Mag = Mag()
+    acc_bias_sd_mps2: Positive = Field(0.05, description="sd of the accelerometer's bias at the start")
+    gyr_bias_sd_dps: Positive = Field(0.6, description="sd of the gyro's bias at the start, deg/s")
+    max_gap_s: Positive = Field(30.0, description="a log with a longer IMU outage is refused")
+
+
+class MotionSettings(ConfigSection):
+    """What carries the state from one keyframe to the next."""
+
+    model: Literal["imu", "constant_velocity"] | None = Field(
+        None, description="the IMU, or a constant velocity without it; null = the IMU where the log has one"
+    )
+    acc: Positive = Field(0.1, description="constant velocity: noise density of the acceleration [m/s2/rtHz]")
+    gyr: Positive = Field(0.3, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
+    rate_sd_dps: Positive = Field(
+        5.0, description="constant velocity: sd of the rate of turn, which a DVL on a lever arm sees"
+    )
+
+
+class Dvl(ConfigSection):
+    """Doppler velocity log: mounting and noise."""
+
+    preset: DvlPreset | None = Field(
+        None, description="instrument whose data sheet fills in missing keys, see docs/presets.md"
+    )
+    mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
+    velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")
+    water_velocity_sd_mps: PositiveTriple = Field((0.03, 0.03, 0.03), description="noise of a water-track ping")
+    scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is rejected; null = never")
+    readmit_s: Readmission = 2.0
+    max_speed_mps: Positive = Field(3.0, description="faster pings are ignored")
+
+
+class Heading(ConfigSection):
+    """Heading sources and their noise."""
+
+    sources: tuple[HeadingSource, ...] | None = Field(
+        None,
+        description="any of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle in the log",
+    )
+    mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
+    dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
+    ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
+    vehicle_sd_deg: Positive = Field(3.0, description="noise of the vehicle's own heading")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is rejected")
+    readmit_s: Readmission = 60.0
+
+
+class TiltSettings(ConfigSection):
+    """The vehicle's own roll and pitch, which are used where there is no IMU."""
+
+    sd_deg: Positive = Field(1.0, description="noise of roll and of pitch")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="roll and pitch further off than this many sd are rejected")
+    readmit_s: Readmission = 10.0
+
+
+class Depth(ConfigSection):
+    """Pressure sensor."""
+
+    sd_m: Positive = Field(0.05, description="noise of a depth sample")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is rejected")
+    readmit_s: Readmission = 10.0
+
+
+class Fix(ConfigSection):
+    """Position fixes."""
+
+    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; fix_sd takes precedence")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is rejected")
+    readmit_s: Readmission = 300.0
+
+
+class Place(ConfigSection):
+    """Places seen before, as a camera or a sonar recognises them."""
+
+    sd_m: Positive = Field(
+        0.3, description="sd of the camera's distance from a place, north and east; place_sd takes precedence"
+    )
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the camera or sonar in body axes")
+    every_s: NotNegative = Field(5.0, description="a place that stays in view is used once in this time")
+    remembered: Annotated[int, Field(ge=1)] = Field(
+        20, description="places that a filter remembers; it then forgets the one not seen for longest"
+    )
+    loss: Loss = Field("cauchy", description="robust loss")
+    gate_sd: Positive | None = Field(4.0, description="an observation further off than this many sd is a false match")
+
+
+class SensorSettings(ConfigSection):
+    """Keys of a registered sensor; derive a class for other defaults or more keys."""
+
+    sd: Positive = Field(1.0, description="noise of a measurement, every component")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the sensor in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is rejected")
+    readmit_s: Readmission = 10.0
+
+
+class RegisteredSensors(ConfigSection):
+    """Sensors that were registered, each with the keys of its own `SensorSettings`."""
+
+
+class Thruster(ConfigSection):
+    """One thruster: where it is and which way it pushes for a positive signal."""
+
+    position_m: Triple = Field(description="position in body axes")
+    direction: Triple = Field(description="direction of the force for a positive signal, body axes; any length")
+
+
+# The thesis gives none. Four vectored horizontal thrusters at the corners of the frame, 45 degrees
+# to the keel, and a vertical one in the middle, as on a Saab Seaeye Falcon: a choice.
+FALCON_THRUSTERS = (
+    Thruster(position_m=(0.35, 0.22, 0.0), direction=(1.0, -1.0, 0.0)),
+    Thruster(position_m=(0.35, -0.22, 0.0), direction=(1.0, 1.0, 0.0)),
+    Thruster(position_m=(-0.35, 0.22, 0.0), direction=(1.0, 1.0, 0.0)),
+    Thruster(position_m=(-0.35, -0.22, 0.0), direction=(1.0, -1.0, 0.0)),
+    Thruster(position_m=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)),
+)
+
+
+class Vehicle(ConfigSection):
+    """Hydrodynamics (2.16)-(2.24); the defaults are the thesis's Falcon, along forward, starboard, down."""
+
+    mass_kg: Positive = Field(73.3, description="mass; buoyancy is assumed equal to the weight")
+    added_mass_kg: NotNegativeTriple = Field((27.0, 30.0, 110.0), description="added mass")
+    inertia_kgm2: PositiveTriple = Field((3.7, 7.6, 8.3), description="moments of inertia")
+    added_inertia_kgm2: NotNegativeTriple = Field((9.0, 15.0, 11.47), description="added moments of inertia")
+    drag_linear: NotNegativeTriple = Field((42.0, 180.0, 90.0), description="linear drag [N s/m]")
+    drag_quadratic: NotNegativeTriple = Field((140.0, 55.0, 400.0), description="quadratic drag [N s2/m2]")
+    turning_drag_linear: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="linear drag of turning [N m s]")
+    turning_drag_quadratic: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="quadratic drag of turning")
+    centre_of_buoyancy_m: Triple = Field((0.0, 0.0, -0.2), description="centre of buoyancy, from the centre of mass")
+    thrust: Triple = Field(
+        (0.32, -0.016, 2.98e-4), description="thrust [N] of a signal u: a u + b |u| u + c u^3 (2.21)"
+    )
+    thrust_rise_s: NotNegative = Field(
+        0.12, description="time from 10 to 90 percent of a change of thrust, below (2.22); 0 = at once"
+    )
+    thrusters: tuple[Thruster, ...] = Field(FALCON_THRUSTERS, description="thruster_1, thruster_2, ... of the log")
+    acceleration_sd_mps2: Positive = Field(0.02, description="error of the model's acceleration, mean of a second")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is rejected")
+    readmit_s: Readmission = 10.0
+
+
+class Graph(ConfigSection):
+    """How the graph is built and solved."""
+
+    keyframe: Literal["dvl"] = Field("dvl", description="what makes a keyframe")
+    max_gap_s: Positive = Field(
+        1.0, description="longest time between keyframes; a ping up to a quarter of it later makes the keyframe itself"
+    )
+    min_gap_s: NotNegative = Field(
+        0.05, description="shortest time between keyframes; closer pings belong to the keyframe before"
+    )
+    solver: Literal["batch", "isam2"] = Field(
+        "batch", description="solver of the smoothed estimate; isam2 is incremental"
+    )
+    segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
+    lag_s: Positive = Field(5.0, description="online: how late a measurement may come; no effect on a recorded log")
+    hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
+    find_noise: bool = Field(
+        True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
+    )
+
+    @property
+    def ping_due_s(self) -> float:
+        """How much later than `max_gap_s` a ping still makes the keyframe [s].
+
+        A quarter of it, more than the periods of DVLs vary by; and at least `min_gap_s`, so that one which comes
+        later still is far enough from the keyframe before it to make its own.
+        """
+        return max(0.25 * self.max_gap_s, self.min_gap_s)
+
+
+def _stamped(sensor: str) -> str:
+    """Refuses what is no sensor, among them those that are registered."""
+    known = (*STAMPED, *RegisteredSensors.model_fields)
+    if sensor not in known:
+        expected = ", ".join(map(repr, known[:-1])) + f" or {known[-1]!r}"
+        raise PydanticCustomError("literal_error", "expected {expected}", {"expected": expected})
+    return sensor
+
+
+Delays = dict[Annotated[str, AfterValidator(_stamped)], float]  # sensor -> how late its stamps are known to be [s]
+
+
+class DateSettings(ConfigSection):
+    """What dates as text leave open."""
+
+    order: Literal["dmy", "mdy"] | None = Field(
+        None, description="order of day and month in dates such as 05/01/2026; null = as the dates themselves show"
+    )
+    zone_h: float = Field(0.0, ge=-14, le=14, description="hours ahead of UTC of dates that state no zone [h]")
+    date: dt.date | None = Field(None, description="day of times of day without a date, e.g. 2026-05-01")
+
+    @property
+    def rules(self) -> DateRules:
+        """The same, for those who read dates."""
+        return DateRules(self.order, self.zone_h, None if self.date is None else self.date.isoformat())
+
+
+COLUMNS_TEXT = "rovgraph's column: the log's own name for it"
+UNITS_TEXT = "column or sensor: unit it is in, e.g. gyr: deg/s"
+ANGLES_TEXT = (
+    "ahrs, attitude, dvl_heading, or a column: how its heading counts; ned, enu or nwu (axes forward, port, up), east"
+)
+Angles = dict[str, Literal["ned", "enu", "nwu", "east"]]
+
+
+class TableSettings(ConfigSection):
+    """How a table is written: names, units, senses of angles and times."""
+
+    columns: dict[str, str] = Field(default_factory=dict, description=COLUMNS_TEXT)
+    units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)
+    angles: Angles = Field(default_factory=dict, description=ANGLES_TEXT)
+    times: DateSettings = DateSettings()
+
+
+AS_WRITTEN: dict[str, object] = {
+    "columns": {},
+    "units": {},
+    "angles": {},
+    "times": DateSettings(),
+    "files": {},
+}  # by rovgraph
+
+
+class FileSettings(TableSettings):
+    """How one of several files is written, where it differs from the others."""
+
+    delay_s: float = Field(0.0, description="how much older its measurements are than their stamps")
+
+
+class OnlineSettings(ConfigSection):
+    """The online mode."""
+
+    hold_s: NotNegative = Field(0.3, description="measurements wait this long for late ones; later ones cost more time")

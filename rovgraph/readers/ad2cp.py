@@ -1,0 +1,231 @@
+"""Nortek AD2CP files: bottom tracks of Signature instruments (record 0x17), tracks of DVLs (0x1B, 0x1D)."""
+
+import mmap
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, wrap_angle
+from rovgraph.log.beams import BEAMS
+from rovgraph.readers.ardupilot import FRESH, GRAVITY
+from rovgraph.readers.formats import ReadingOptions
+from rovgraph.readers.nortek import (
+    AD2CP_FAMILIES,
+    BAR,
+    NortekTrack,
+    Records,
+    beam_table,
+    bottom_channels,
+    find_records,
+    water_channels,
+    where_bits,
+)
+from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.readers.records import gathered, layout
+from rovgraph.readers.stamps import unix_of_calendar
+
+SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
+CLOCK = "instrument's clock"
+ZONE_SD_S = 6 * 3600.0  # of a clock whose time zone nobody states
+ENU, XYZ, BEAM = range(3)  # coordinates of a Signature's velocities
+BEAM_ANGLE = np.deg2rad(25.0)  # of a Signature, as its own transformation matrix has it
+NO_MERIT = 65535  # figure of merit of a beam that heard nothing
+HAS_VELOCITY, HAS_DISTANCE, HAS_MERIT = 1 << 5, 1 << 8, 1 << 9
+OTHERS = {
+    0x15: "burst of a profile", 0x16: "average of a profile", 0x18: "burst of the fifth beam",
+    0x1A: "raw altimeter", 0x1C: "echo sounder", 0x1E: "altimeter", 0x1F: "average altimeter", 0xA0: "text",
+}  # fmt: skip
+_HEAD = [("version", "u1", 0), ("offset", "u1", 1)]
+_DATE = "6u1"  # years since 1900, months since January, day, hour, minute, second
+SIGNATURE_FIELDS = layout(
+    *_HEAD, ("config", "<u2", 2), ("date", _DATE, 8), ("fraction", "<u2", 14), ("pressure", "<u4", 20),
+    ("heading", "<u2", 24), ("pitch", "<i2", 26), ("roll", "<i2", 28), ("beams", "<u2", 30), ("scale", "i1", 60),
+)  # fmt: skip
+DVL_FIELDS = layout(
+    *_HEAD, ("date", _DATE, 6), ("fraction", "<u2", 12), ("status", "<u4", 20), ("pressure", "<f4", 32),
+    ("beams", "4<f4", 36), ("distance", "4<f4", 52), ("merit", "4<f4", 68), ("velocity", "4<f4", 132),
+    ("sd", "4<f4", 148), ("delay", "4<f4", 164),
+)  # fmt: skip
+
+
+class AD2CP:
+    """The format; see `rovgraph.readers.formats.Format`."""
+
+    name = "ad2cp"
+    title = "Nortek AD2CP or DVL file (.ad2cp)"
+    extra = ""
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        return 0.95 if find_records(head, AD2CP_FAMILIES).at else 0.0
+
+    def read(self, path: Path, options: ReadingOptions) -> Recording:
+        with path.open("rb") as file:
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        found = find_records(content, AD2CP_FAMILIES, lambda done: options.progress(done, len(content)))
+        channels: list[Channel] = []
+        tables: dict[str, dict[str, Array]] = {}
+        notes = []
+        signature, refused = decoded_signature(content, found)
+        tracks = {SIGNATURE: signature} | {k: decoded_dvl(content, found, k) for k in (DVL_BOTTOM, DVL_WATER)}
+        for kind, track in tracks.items():
+            if not len(track.time):
+                continue
+            if kind == DVL_WATER:
+                channels += water_channels(track, f"water track {kind:#x}", CLOCK)
+            else:
+                channels += bottom_channels(track, f"bottom track {kind:#x}", CLOCK)
+                tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = beam_table(track)
+        channels += _attitude(content, found)
+        channels += _depth(content, found)
+        if not channels:
+            raise InputError(f"{path}: holds no bottom track (records 0x17, 0x1B); the instrument has to record it")
+        if any(channel.sensor == "depth" for channel in channels):
+            notes.append(f"depth is pressure in fresh water ({FRESH:g} kg/m3) above the offset that the instrument has")
+        return Recording(
+            str(path), self.name, tuple(channels), {CLOCK: Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")},
+            tuple(_left(found, refused)), notes=tuple(notes), warnings=tuple(_warnings(found, refused, channels)),
+            tables=tables,
+        )  # fmt: skip
+
+
+FORMAT = AD2CP()
+
+
+def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[NortekTrack, int]:
+    """Bottom track of a Signature, and how many pings have axes that are not turned back.
+
+    It is the bottom that moves here, away from the instrument where positive.
+    """
+    at, size = found.at.get(SIGNATURE, []), found.size.get(SIGNATURE, [])
+    said, _ = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
+    count = len(said)
+    empty = np.full((count, 4), np.nan)
+    whole = (said["beams"] >> 12 == 4) & (said["config"] & HAS_VELOCITY != 0)
+    parts = {}
+    start = np.array(at, dtype=np.int64) + said["offset"]
+    end = np.array(at, dtype=np.int64) + np.array(size, dtype=np.int64)
+    for name, bit, kind in (
+        ("velocity", HAS_VELOCITY, "<i4"),
+        ("distance", HAS_DISTANCE, "<i4"),
+        ("merit", HAS_MERIT, "<u2"),
+    ):
+        there = whole & (said["config"] & bit != 0)
+        fields = layout(("value", f"4{kind}", 0))
+        values, read = gathered(
+            content, fields, np.where(there, start, -1).tolist(), (end - start).tolist(), fields.itemsize
+        )
+        parts[name] = np.where(read[:, None], values["value"], np.nan).astype(float)
+        start = start + np.where(there, fields.itemsize, 0)
+    heard = (parts["merit"] != NO_MERIT) & (parts["distance"] > 0.0)
+    raw = np.where(heard, parts["velocity"] * 10.0 ** said["scale"][:, None].astype(float), np.nan)
+    system = (said["beams"] >> 10) & 3
+    velocity = np.where((system == BEAM)[:, None], _of_beams(raw), np.column_stack([raw[:, :2], _either(raw[:, 2:])]))
+    turned = system == ENU
+    rpy = np.deg2rad(0.01 * np.column_stack([said[name].astype(float) for name in ("roll", "pitch", "heading")]))
+    velocity[turned] = _of_enu(velocity[turned], rpy[turned])
+    known = system <= BEAM
+    velocity[~known] = np.nan
+    time = _time(said["date"], said["fraction"])
+    merit = np.where(heard, 1e-3 * parts["merit"], np.nan)
+    distance = np.where(heard, 1e-3 * parts["distance"], np.nan)
+    track = NortekTrack(time, np.zeros(count), -velocity, empty[:, :3], distance, raw, merit)
+    return track, int(np.count_nonzero(~known))
+
+
+def _of_enu(velocity: Array, rpy: Array) -> Array:
+    """X, Y and Z, shape (n, 3), of east, north and up, by roll, pitch and heading of the record.
+
+    Pitch lifts X. Source: Nortek, Coordinate transformations, support FAQ.
+    """
+    (sr, sp, sh), (cr, cp, ch) = np.sin(rpy.T), np.cos(rpy.T)
+    zero = np.zeros(len(rpy))
+    heading = np.array([[sh, -ch, zero], [ch, sh, zero], [zero, zero, zero + 1.0]])
+    tilt = np.array([[cp, -sp * sr, -cr * sp], [zero, cr, -sr], [sp, sr * cp, cp * cr]])
+    return np.asarray(np.einsum("ikn,kjn,ni->nj", heading, tilt, velocity))
+
+
+def _of_beams(beams: Array) -> Array:
+    """X, Y and Z, shape (n, 3), of beams that point to X, -Y, -X and Y."""
+    b1, b2, b3, b4 = beams.T
+    across, along = 1.0 / (2.0 * np.sin(BEAM_ANGLE)), 1.0 / (2.0 * np.cos(BEAM_ANGLE))
+    return np.column_stack([across * (b1 - b3), across * (b4 - b2), 0.5 * along * (b1 + b2 + b3 + b4)])
+
+
+def _either(pair: Array) -> Array:
+    """Mean of two measurements of one axis, shape (n,); either one where the other is missing."""
+    there = np.isfinite(pair).sum(axis=1)
+    return np.where(there > 0, np.nansum(pair, axis=1) / np.maximum(there, 1), np.nan)
+
+
+def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> NortekTrack:
+    """Bottom or water track of a DVL: the status says what of it is valid, two estimates of Z are averaged."""
+    said, there = gathered(content, DVL_FIELDS, found.at.get(kind, []), found.size.get(kind, []), DVL_FIELDS.itemsize)
+    said = said[there]
+    status = said["status"]
+    velocity = where_bits(said["velocity"], status, 12)
+    sd = where_bits(said["sd"], status, 16)
+    return NortekTrack(
+        time=_time(said["date"], said["fraction"]),
+        delay=said["delay"][:, 0].astype(float),
+        velocity=np.column_stack([velocity[:, :2], _either(velocity[:, 2:])]),
+        sd=np.column_stack([sd[:, :2], _either(sd[:, 2:])]),
+        distance=where_bits(said["distance"], status, 4),
+        beams=where_bits(said["beams"], status, 0),
+        merit=where_bits(said["merit"], status, 8),
+    )
+
+
+def _time(date: NDArray[np.uint8], fraction: NDArray[np.uint16]) -> Array:
+    """Seconds since 1970 of calendar dates, shape (n,), NaN for what is none; ``fraction`` is in 0.1 ms."""
+    year, month, day, hour, minute, second = date.astype(np.int64).T
+    return unix_of_calendar(year + 1900, month + 1, day, hour, minute, second) + 1e-4 * fraction
+
+
+def _attitude(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
+    at, size = found.at.get(SIGNATURE, []), found.size.get(SIGNATURE, [])
+    said, there = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
+    if not there.any():
+        return
+    time = _time(said["date"], said["fraction"])
+    heading, pitch, roll = (np.deg2rad(0.01 * said[name].astype(float)) for name in ("heading", "pitch", "roll"))
+    source = "bottom track 0x17"
+    yield Channel("dvl_heading", {"time": time, "dvl_heading": wrap_angle(heading)}, f"{source}: heading", "", CLOCK)
+    yield Channel("vehicle_tilt", {"time": time, "roll": roll, "pitch": pitch}, f"{source}: roll, pitch", "", CLOCK)
+
+
+def _depth(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
+    for kind, fields, to_pascal in (
+        (DVL_BOTTOM, DVL_FIELDS, BAR),
+        (SIGNATURE, SIGNATURE_FIELDS, 1e-3 * 0.1 * BAR),
+    ):
+        said, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
+        if there.any():
+            depth = to_pascal * said["pressure"].astype(float) / (FRESH * GRAVITY)
+            time = _time(said["date"], said["fraction"])
+            yield Channel("depth", {"time": time, "depth": depth}, f"bottom track {kind:#x}: pressure", "", CLOCK)
+
+
+def _left(found: Records, refused: int) -> Iterator[Left]:
+    for kind, at in sorted(found.at.items()):
+        if kind not in (SIGNATURE, DVL_BOTTOM, DVL_WATER):
+            yield Left(OTHERS.get(kind, f"record {kind:#04x}"), len(at), "no measurement of a sensor")
+    if found.failed:
+        yield Left("record", found.failed, "a wrong checksum, or cut off")
+    if refused:
+        yield Left("velocity", refused, "unknown coordinates; record beams or XYZ")
+
+
+def _warnings(found: Records, refused: int, channels: list[Channel]) -> Iterator[str]:
+    if found.failed:
+        yield f"{found.failed} records are damaged or cut off, and left out"
+    if found.skipped:
+        yield f"{found.skipped} bytes belong to no whole record"
+    if refused:
+        yield f"{refused} velocities are in unknown coordinates and left out; record beams or XYZ"
+        return
+    dvl = [channel for channel in channels if channel.sensor == "dvl"]
+    if not any(np.any(channel.columns["dvl_valid"]) for channel in dvl):
+        yield "no bottom track: the instrument did not look for the bottom, or never saw it"

@@ -1,0 +1,109 @@
+"""rovgraph's own log (docs/log-format.md) as one of the formats, so that it can be read beside native files.
+
+A log that is read alone does not come here: `rovgraph.log.read_log` reads it.
+"""
+
+import warnings as python_warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from rovgraph.errors import InputError, collected_warnings
+from rovgraph.geometry import Array
+from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
+from rovgraph.log.reading import in_order, numbers, read_columns
+from rovgraph.log.stamps import UNIX_S
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
+from rovgraph.log.tables import names_of, read_table
+from rovgraph.log.units import name_and_bracket
+from rovgraph.readers.formats import ReadingOptions
+from rovgraph.readers.recording import Channel, Clock, Left, Recording
+
+SURE = 0.95
+IN_RECEIVED = "host that received"
+
+
+class OwnLog:
+    """CSV or Parquet in rovgraph's columns, or in those that a configuration maps."""
+
+    name = "log"
+    title = "rovgraph log (CSV, Parquet)"
+    extra = "parquet"
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        """By the names of the columns; a Parquet file can be nothing else."""
+        return SURE if is_own_log(head) else 0.0
+
+    def read(self, path: Path, options: ReadingOptions) -> Recording:
+        """Every sensor of the log, its stamps one clock."""
+        with collected_warnings() as texts, python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")  # said by whoever joins recordings, with the name of the file
+            table = read_table(path)
+            cells, names = read_columns(table, options.table)
+            beams = beams_beside(path)
+            if RECEIVED in table.names:
+                cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+            try:
+                cells = cells if options.arrival else in_order(cells, table.line, table.source, RECEIVED in cells)[0]
+            except InputError:
+                if RECEIVED not in cells:  # by which each sensor's stamps are put right
+                    raise
+        channels = tuple(_channels(cells))
+        if not channels:
+            raise InputError(f"{path}: no measurement of any sensor in it; columns: {', '.join(table.names)[:200]}")
+        clock = _clock(cells["time"])
+        clocks = {clock.name: clock}
+        if RECEIVED in cells:
+            clocks[IN_RECEIVED] = Clock(IN_RECEIVED, 0.0, 0.0, "Unix time of arrival")
+        ignored = [name for name in table.names if name not in names.values() and name != RECEIVED]
+        left = tuple(Left(name, int(table.frame[name].notna().sum()), "no column of a log") for name in ignored)
+        tables = {} if beams is None else {BEAMS: {str(n): c.to_numpy(float) for n, c in beams_frame(beams).items()}}
+        return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts), tables=tables)
+
+
+FORMAT = OwnLog()
+
+
+def is_own_log(head: bytes, columns: Mapping[str, str] | None = None) -> bool:
+    """Whether a file that begins like this is a log: its header has a time and a sensor's column.
+
+    Parameters
+    ----------
+    columns : rovgraph's name -> the log's own, of a configuration
+    """
+    if head.startswith(b"PAR1"):
+        return True
+    own, header = dict(columns or {}), set(names_of(head))
+    header |= {name_and_bracket(name)[0] for name in header}
+    found = {name for name in header if is_column(name)} | {
+        own_name for own_name, name in own.items() if name in header
+    }
+    return "time" in found and len(found) > 1
+
+
+def _channels(cells: Mapping[str, Array]) -> list[Channel]:
+    """A channel per sensor, of the rows in which any of its columns is filled."""
+    thrusters = tuple(sorted((c for c in cells if THRUSTER.fullmatch(c)), key=lambda c: int(c.partition("_")[2])))
+    sensors = {**{sensor: tuple(STREAMS[sensor]) for sensor in STREAMS}, "thruster": thrusters}
+    sensors["fix"] = (*sensors["fix"], *LAT_LON)
+    out = []
+    for sensor, columns in sensors.items():
+        present = [c for c in columns if c in cells]
+        if not present:
+            continue
+        rows = np.any([~np.isnan(cells[c]) for c in present], axis=0)
+        if not rows.any():
+            continue
+        own = {name: cells[name][rows] for name in ("time", *present)}
+        received = cells[RECEIVED][rows] if RECEIVED in cells else None
+        receiver = "" if received is None else IN_RECEIVED
+        out.append(Channel(sensor, own, f"columns {', '.join(present)}", "", "time", received, receiver))
+    return out
+
+
+def _clock(time: Array) -> Clock:
+    """The clock of the column ``time``: Unix where its stamps look like it."""
+    known = time[np.isfinite(time)]
+    unix = len(known) > 0 and UNIX_S[0] < np.median(known) < UNIX_S[1]
+    return Clock("time", 0.0, 0.0, "stamps look like Unix time") if unix else Clock("time")

@@ -1,0 +1,263 @@
+"""Pings of Teledyne's Doppler instruments as channels of a log, whatever they were written as.
+
+A log has the velocity of the instrument, along axes forward (beam 3, or the ship's bow), starboard, down.
+
+Velocities of Teledyne's Doppler instruments, from any of their coordinate systems to forward, starboard, down.
+
+An instrument has X from beam 1 to beam 2, Y from beam 4 to beam 3 and Z away from the bottom it looks at; a ship has X
+to starboard, Y forward and Z up the mast; Earth has east, north, up. Source: Teledyne RD Instruments, ADCP Coordinate
+Transformation, P/N 951-6079-00.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
+from rovgraph.log.beams import BEAMS
+from rovgraph.readers.recording import Channel, Clock, Left, Recording
+
+BEAM, INSTRUMENT, SHIP, EARTH = range(4)
+SYSTEMS = "beam", "instrument", "ship", "earth"
+FORWARD = np.array([1, 0, 2])  # places of forward, starboard and the vertical in a triple
+DOWN = np.array([1.0, 1.0, -1.0])  # the vertical turned downwards
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How each of n velocities was measured.
+
+    Attributes
+    ----------
+    rpy : ndarray, shape (n, 3), roll, pitch, heading that the instrument computed with [rad]
+    tilted : ndarray of bool, shape (n,), roll and pitch were used for ship or Earth axes
+    upward : ndarray of bool, shape (n,), the instrument looks up
+    beam_angle : ndarray, shape (n,), of the beams against its axis [rad]
+    convex : ndarray of bool, shape (n,), the beams diverge
+    """
+
+    rpy: Array
+    tilted: NDArray[np.bool_]
+    upward: NDArray[np.bool_]
+    beam_angle: Array
+    convex: NDArray[np.bool_]
+
+
+def forward_starboard_down(values: Array, system: NDArray[np.integer], attitude: Attitude) -> tuple[Array, Array]:
+    """Velocities along axes forward (Y), starboard (X) and down (-Z) of the instrument, upwards ones turned over.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, 4), four beams, or three axes and the error velocity; NaN = not measured [m/s]
+    system : ndarray, shape (n,), `BEAM`, `INSTRUMENT`, `SHIP` or `EARTH`
+
+    Returns
+    -------
+    velocity, shape (n, 3), and error velocity, shape (n,) [m/s]
+    """
+    values = np.where((system == BEAM)[:, None], _of_beams(values, attitude), values)
+    velocity = values[:, FORWARD] * DOWN
+    own = (system == BEAM) | (system == INSTRUMENT)
+    velocity[own & attitude.upward] *= [1.0, -1.0, -1.0]  # turned over about the forward axis
+    angles = attitude.rpy * np.column_stack([attitude.tilted, attitude.tilted, system == EARTH])
+    velocity[:] = np.where(own[:, None], velocity, (velocity[:, None] @ matrix_from_rpy(angles))[:, 0])
+    return velocity, values[:, 3]
+
+
+def _of_beams(beams: Array, attitude: Attitude) -> Array:
+    """X, Y, Z and error velocity of beams, shape (n, 4); one beam that is missing is what gives no error."""
+    missing = np.isnan(beams)
+    signs = np.array([1.0, 1.0, -1.0, -1.0])
+    rest = np.nansum(beams * signs, axis=1, keepdims=True)
+    three = missing.sum(axis=1, keepdims=True) == 1
+    beams = np.where(missing & three, -rest * signs, beams)
+    b1, b2, b3, b4 = beams.T
+    across = 1.0 / (2.0 * np.sin(attitude.beam_angle))
+    sign = np.where(attitude.convex, 1.0, -1.0)
+    error = np.where(three[:, 0], np.nan, across / np.sqrt(2.0) * (b1 + b2 - b3 - b4))
+    vertical = (b1 + b2 + b3 + b4) / (4.0 * np.cos(attitude.beam_angle))
+    return np.column_stack([sign * across * (b1 - b2), sign * across * (b4 - b3), vertical, error])
+
+
+CLOCK = "DVL's clock"
+FRAME = "forward (beam 3, or the ship's bow), starboard, down"
+NAMES = "dvl_vx", "dvl_vy", "dvl_vz"
+WATER = "dvl_water_vx", "dvl_water_vy", "dvl_water_vz"
+
+
+@dataclass(frozen=True)
+class Pings:
+    """What n ensembles say, in SI.
+
+    Attributes
+    ----------
+    time : shape (n,), as if its calendar were UTC [s since 1970]; NaN where the date is none
+    system : shape (n,), coordinates (`rovgraph.readers.trdi`)
+    velocity, water : shape (n, 3), over the bottom and through the water, axes as `FRAME` says; NaN = none [m/s]
+    error : shape (n,), error velocity of the bottom track [m/s]
+    rpy : shape (n, 3), roll, pitch and heading as printed [rad]
+    bias : shape (n,), what was added to the heading [rad]
+    alignment : shape (n,), of beam 3 against the bow [rad]
+    tilted : shape (n,), roll and pitch were used for ship or Earth axes
+    depth : shape (n,) [m]
+    range : shape (n, 4), to the bottom along the vertical; NaN = none [m]
+    beams : shape (n, 4), velocity of the bottom towards each beam; NaN = not written [m/s]
+    quality : name -> shape (n, 4), of the beams
+    position : shape (n, 2), latitude and longitude; NaN = none [deg]
+    tracked : shape (n,), it looked for the bottom
+    """
+
+    time: Array
+    system: NDArray[np.integer]
+    velocity: Array
+    water: Array
+    error: Array
+    rpy: Array
+    bias: Array
+    alignment: Array
+    tilted: NDArray[np.bool_]
+    depth: Array
+    range: Array
+    beams: Array
+    quality: dict[str, Array]
+    position: Array
+    tracked: NDArray[np.bool_]
+
+
+def recording(
+    path: Path, name: str, pings: Pings, clock: Clock, left: tuple[Left, ...], warnings: tuple[str, ...]
+) -> Recording:
+    """A recording of all pings of a file.
+
+    Parameters
+    ----------
+    name : of the file's format
+    left, warnings : what its reader has to say
+
+    Raises
+    ------
+    InputError : none of them has a time
+    """
+    dated = np.isfinite(pings.time)
+    if not dated.any():
+        raise InputError(f"{path}: none of {len(dated)} ensembles has a valid time; set the instrument's clock")
+    channels = tuple(channels_of(pings))
+    more = []
+    if undated := int(np.count_nonzero(~dated)):
+        more.append(Left("ensemble", undated, "no valid time"))
+    if located := int(np.isfinite(pings.position[:, 0]).sum()):
+        more.append(Left("position", located, "reckoned by the vehicle"))
+    return Recording(
+        str(path),
+        name,
+        channels,
+        {clock.name: clock},
+        (*left, *more),
+        _settings(pings),
+        tuple(_notes(pings)),
+        (*warnings, *_warnings(pings, channels)),
+        _tables(pings, dated),
+    )
+
+
+def channels_of(pings: Pings, constants: bool = False) -> Iterator[Channel]:
+    """Channels of all pings that have a time.
+
+    Parameters
+    ----------
+    constants : what is one number throughout is a measurement, as in a single ping; else nothing measured it
+    """
+    dated = np.isfinite(pings.time)
+
+    def channel(sensor: str, rows: NDArray[np.bool_], source: str, frame: str, **columns: Array) -> Iterator[Channel]:
+        rows = rows & dated
+        if rows.any():
+            kept = {name: values[rows] for name, values in (("time", pings.time), *columns.items())}
+            yield Channel(sensor, kept, f"{source}: {', '.join(columns)}", frame, CLOCK)
+
+    valid = np.asarray(np.isfinite(pings.velocity).all(axis=1))
+    velocity = dict(zip(NAMES, np.where(valid[:, None], pings.velocity, np.nan).T, strict=True))
+    yield from channel("dvl", pings.tracked, "bottom track", FRAME, **velocity, dvl_valid=valid.astype(float))
+    through = np.asarray(np.isfinite(pings.water).all(axis=1))
+    yield from channel("dvl_water", through, "water layer", FRAME, **dict(zip(WATER, pings.water.T, strict=True)))
+    seen = np.isfinite(pings.range)
+    altitude = np.nansum(pings.range, axis=1) / np.maximum(seen.sum(axis=1), 1)
+    bounced = np.asarray(seen.any(axis=1))
+    yield from channel("dvl_altitude", bounced, "mean range of the beams", "", dvl_altitude=altitude)
+    roll, pitch, heading = pings.rpy.T
+    heading = wrap_angle(heading - pings.bias)
+    ship = pings.system == SHIP
+    if _measured(heading, constants):
+        yield from channel("vehicle_heading", ship, "heading", FRAME, heading=heading)
+        yield from channel("dvl_heading", ~ship, "heading", FRAME, dvl_heading=heading)
+    if _measured(roll, constants) or _measured(pitch, constants):
+        yield from channel("vehicle_tilt", np.ones(len(roll), dtype=bool), "attitude", FRAME, roll=roll, pitch=pitch)
+    if _measured(pings.depth, constants):
+        yield from channel("depth", np.ones(len(roll), dtype=bool), "depth of the transducer", "", depth=pings.depth)
+
+
+def _measured(values: Array, constants: bool = False) -> bool:
+    """Whether there is a measurement; what nothing measures is one number throughout."""
+    return bool(np.ptp(values) > 0.0) or (constants and bool(np.isfinite(values).any()))
+
+
+def _settings(pings: Pings) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    alignment, bias = np.unique(pings.alignment), np.unique(pings.bias)
+    if len(alignment) == 1 and alignment[0] and np.all(pings.system < SHIP):
+        out["dvl"] = {"mount_rpy_deg": [0.0, 0.0, round(float(np.rad2deg(alignment[0])), 2)]}
+    if len(bias) == 1 and bias[0]:
+        out["environment"] = {"declination_deg": round(float(np.rad2deg(bias[0])), 2)}
+    located = np.flatnonzero(np.isfinite(pings.position[:, 0]))
+    if len(located):
+        lat, lon = (round(float(v), 7) for v in pings.position[located[0]])
+        out["environment"] = out.get("environment", {}) | {"origin_lat_deg": lat, "origin_lon_deg": lon}
+    return out
+
+
+def _notes(pings: Pings) -> Iterator[str]:
+    systems, counts = np.unique(pings.system, return_counts=True)
+    said = ", ".join(f"{SYSTEMS[s]} {n}" for s, n in zip(systems, counts, strict=True))
+    yield f"ensembles by their coordinates: {said}"
+    if np.any(pings.system >= SHIP):
+        used = int(np.count_nonzero(pings.tilted & (pings.system >= SHIP)))
+        if used:
+            yield f"roll and pitch are taken out of the ship or earth velocities of {used} ensembles"
+    error = np.abs(pings.error[np.isfinite(pings.error)])
+    if len(error):
+        sd = 1.4826 * float(np.median(error))
+        yield f"error velocity {sd:.3f} m/s (from its median), which is the noise of a horizontal axis"
+    if np.isfinite(pings.position).any():
+        yield "the vehicle's own position is in the table position; its first one is the origin"
+
+
+def _warnings(pings: Pings, channels: tuple[Channel, ...]) -> Iterator[str]:
+    dvl = next((c for c in channels if c.sensor == "dvl"), None)
+    if dvl is None or not np.any(dvl.columns["dvl_valid"]):
+        yield "no bottom track: the instrument did not look for the bottom, or never saw it"
+    if np.isfinite(pings.rpy[:, 2]).any() and not _measured(pings.rpy[:, 2]):
+        turned = "; velocities in earth axes are turned by it" if np.any(pings.system == EARTH) else ""
+        yield f"the heading is {np.rad2deg(pings.rpy[0, 2]):.2f} deg throughout, so nothing measured it{turned}"
+    if np.any(pings.alignment[pings.system != SHIP]):
+        yield "beam 3 is not at the bow (EA): compare the heading and the mounting of the DVL with `rovgraph check`"
+
+
+def _tables(pings: Pings, dated: NDArray[np.bool_]) -> dict[str, dict[str, Array]]:
+    rows = dated & pings.tracked
+    out: dict[str, dict[str, Array]] = {}
+    if rows.any():
+        by_beam = {"range": pings.range, "velocity": pings.beams, **pings.quality}
+        if not np.isfinite(pings.beams).any():
+            del by_beam["velocity"]
+        columns = {f"{name}_{k + 1}": values[rows, k] for name, values in by_beam.items() for k in range(4)}
+        out[BEAMS] = {"time": pings.time[rows], **columns, "error_velocity": pings.error[rows]}
+    located = dated & np.isfinite(pings.position[:, 0])
+    if located.any():
+        lat, lon = pings.position[located].T
+        out["position"] = {"time": pings.time[located], "lat": lat, "lon": lon}
+    return out

@@ -1,0 +1,273 @@
+"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; heights above sea level.
+
+KML and KMZ for Google Earth and chart plotters: a track that moves with time, 95 % ellipses and fixes.
+
+GPX 1.1 for chart plotters and phones: a track; elevation is above sea level.
+
+GeoPackage and shapefile for a GIS: points with everything that is known of them, in any coordinates.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.errors import InputError, in_one_line, warn
+from rovgraph.geometry import Array
+from rovgraph.report.export.formats import ExportFormat, ExportOptions
+from rovgraph.report.export.track import SHOWN_HZ, Track, ellipse, point_table
+
+if TYPE_CHECKING:
+    import simplekml
+
+GEOJSON_ELLIPSES = 100  # along a track
+Feature = dict[str, Any]
+
+
+def write_geojson(track: Track, path: Path, options: ExportOptions) -> None:
+    """A feature collection; ``kind`` of each feature is track, point, ellipse or fix."""
+    points = track.at_rate(options.rate_or(SHOWN_HZ))
+    features = [_line(track), *_points(points), *_ellipses(points), *_fixes(track)]
+    collection = {"type": "FeatureCollection", "name": track.name, "features": features}
+    path.write_text(json.dumps(collection, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _line(track: Track) -> Feature:
+    return _feature("LineString", _coordinates(track), kind="track", name=track.name, estimate=track.estimate)
+
+
+def _points(track: Track) -> Iterator[Feature]:
+    table = point_table(track)
+    for where, row in zip(_coordinates(track), table.drop(columns=["lat", "lon"]).to_dict("records"), strict=True):
+        known = {str(name): value for name, value in row.items() if value == value}
+        yield _feature("Point", where, kind="point", **known)
+
+
+def _ellipses(track: Track) -> Iterator[Feature]:
+    t = track.trajectory
+    for k in np.unique(np.linspace(0, len(t) - 1, GEOJSON_ELLIPSES).astype(int)):
+        if np.isfinite(P := t.cov_p[k, :2, :2]).all():
+            ring = _ring(track, t.p_n[k, :2] + ellipse(P))
+            yield _feature("Polygon", [ring], kind="ellipse", time=round(float(t.time[k]), 4), probability=0.95)
+
+
+def _fixes(track: Track) -> Iterator[Feature]:
+    if track.fixes is None:
+        return
+    lat, lon = track.place(*track.fixes.position.T)
+    places = zip(track.fixes.time, track.fixes.used, track.continuous(lon), lat, strict=True)
+    for time, used, *where in places:
+        place = [round(float(x), 9) for x in where]
+        yield _feature("Point", place, kind="fix", time=round(float(time), 4), used=bool(used))
+
+
+def _ring(track: Track, corners: Array) -> list[list[float]]:
+    lat, lon = track.place(*corners[:-1].T)
+    ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
+    return [*ring, ring[0]]
+
+
+def _coordinates(track: Track) -> list[list[float]]:
+    lat, lon = track.lat_lon
+    where = np.column_stack([track.continuous(lon).round(9), lat.round(9), track.height.round(4)])
+    coordinates: list[list[float]] = where[:, : 2 if np.isnan(where[:, 2]).any() else 3].tolist()
+    return coordinates
+
+
+def _feature(kind_of_geometry: str, coordinates: Any, **properties: Any) -> Feature:
+    geometry = {"type": kind_of_geometry, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+_GEOJSON = (ExportFormat("geojson", "GeoJSON", ".geojson", write_geojson, needs_place=True),)
+
+
+KML_ELLIPSES = 60  # along a track
+LINE, USED, REJECTED, SHADE = "ff00a5ff", "ff00c000", "ff0000ff", "4000a5ff"  # aabbggrr
+
+
+def document(track: Track, options: ExportOptions) -> "simplekml.Kml":
+    """The track; with time where that is known, as a plain line elsewhere."""
+    import simplekml
+
+    kml = simplekml.Kml(name=f"{track.name}, {track.estimate}")
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
+    lat, lon = shown.lat_lon
+    lon = track.continuous(lon)
+    height = np.nan_to_num(shown.height)
+    coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()
+    if track.has_utc:
+        line = kml.newgxtrack(name=track.name, altitudemode="absolute")
+        line.newwhen([stamp.strftime("%Y-%m-%dT%H:%M:%S.%fZ") for stamp in shown.utc])
+        line.newgxcoord(coordinates)
+        line.newgxangle([(float(yaw), 0.0, 0.0) for yaw in np.rad2deg(shown.trajectory.rpy[:, 2]).round(3) % 360.0])
+    else:
+        line = kml.newlinestring(name=track.name, altitudemode="absolute", coords=coordinates)
+    line.style.linestyle.color, line.style.linestyle.width = LINE, 3
+    _add_ellipses(kml, shown)
+    _add_fixes(kml, track)
+    return kml
+
+
+def _add_ellipses(kml: "simplekml.Kml", track: Track) -> None:
+    t, folder = track.trajectory, kml.newfolder(name="95 % ellipses")
+    for k in np.unique(np.linspace(0, len(t) - 1, KML_ELLIPSES).astype(int)):
+        if not np.isfinite(P := t.cov_p[k, :2, :2]).all():
+            continue
+        lat, lon = track.place(*(t.p_n[k, :2] + ellipse(P)).T)
+        ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
+        polygon = folder.newpolygon(name=f"{t.time[k] - t.time[0]:.0f} s", outerboundaryis=ring)
+        polygon.style.polystyle.color, polygon.style.linestyle.width = SHADE, 0
+
+
+def _add_fixes(kml: "simplekml.Kml", track: Track) -> None:
+    if track.fixes is None:
+        return
+    folder, start = kml.newfolder(name="fixes"), track.trajectory.time[0]
+    lat, lon = track.place(*track.fixes.position.T)
+    lon = track.continuous(lon)
+    for k, (time, used) in enumerate(zip(track.fixes.time, track.fixes.used, strict=True)):
+        point = folder.newpoint(coords=[(round(float(lon[k]), 9), round(float(lat[k]), 9))])
+        point.description = f"{time - start:.1f} s, {'used' if used else 'rejected'}"
+        point.style.iconstyle.color = USED if used else REJECTED
+        point.style.iconstyle.scale = 0.4
+
+
+def write_kml(track: Track, path: Path, options: ExportOptions) -> None:
+    """Plain XML."""
+    document(track, options).save(str(path), format=False)
+
+
+def write_kmz(track: Track, path: Path, options: ExportOptions) -> None:
+    """The same, compressed."""
+    document(track, options).savekmz(str(path), format=False)
+
+
+_KML = (
+    ExportFormat("kml", "KML", ".kml", write_kml, "maps", needs_place=True),
+    ExportFormat("kmz", "KMZ", ".kmz", write_kmz, "maps", needs_place=True),
+)
+
+
+def write_gpx(track: Track, path: Path, options: ExportOptions) -> None:
+    """A track; with time where that is known."""
+    import gpxpy.gpx
+
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
+    gpx = gpxpy.gpx.GPX()
+    gpx.creator = "rovgraph"
+    line = gpxpy.gpx.GPXTrack(name=f"{track.name}, {track.estimate}")
+    segment = gpxpy.gpx.GPXTrackSegment()
+    times = shown.utc.to_pydatetime() if shown.has_utc else [None] * len(shown.trajectory)
+    for lat, lon, high, time in zip(*shown.lat_lon, shown.height, times, strict=True):
+        height = None if high != high else round(float(high), 4)
+        segment.points.append(gpxpy.gpx.GPXTrackPoint(round(float(lat), 9), round(float(lon), 9), height, time))
+    line.segments.append(segment)
+    gpx.tracks.append(line)
+    path.write_text(gpx.to_xml("1.1"), encoding="utf-8")
+
+
+_GPX = (ExportFormat("gpx", "GPX", ".gpx", write_gpx, "maps", needs_place=True),)
+
+
+WGS84 = "EPSG:4326"
+DRIVERS = {"gpkg": "GPKG", "shp": "ESRI Shapefile"}
+LONGEST = 10  # characters of a shapefile's field name
+
+
+def write_layer(track: Track, path: Path, options: ExportOptions, driver: str) -> None:
+    """A layer of points with the height above sea level as z.
+
+    Raises
+    ------
+    InputError : coordinates that are not known
+    OSError : it cannot be written
+    """
+    import pyogrio.errors
+    import pyogrio.raw
+    import shapely
+
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
+    table = point_table(shown)
+    x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
+    points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(shown.height)])))
+    fields = [name[:LONGEST] if driver == "ESRI Shapefile" else name for name in table.columns]
+    try:
+        pyogrio.raw.write(
+            path,
+            geometry=points,
+            field_data=[_field(table[name]) for name in table.columns],
+            fields=np.array(fields, dtype=object),
+            geometry_type="Point Z",
+            layer=path.stem if driver == "ESRI Shapefile" else "track",
+            crs=crs,
+            driver=driver,
+        )
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.FeatureError) as error:  # as of a full disk
+        raise OSError(in_one_line(error)) from error
+
+
+def _field(column: pd.Series) -> Array:
+    return column.to_numpy(object if not pd.api.types.is_numeric_dtype(column) else float)
+
+
+def projected(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, str]:
+    """Easting and northing in a coordinate system, and its name.
+
+    Parameters
+    ----------
+    lon, lat : ndarray, shape (n,) [deg], WGS 84
+    crs : what pyproj understands, such as "EPSG:25832"; "utm" = the zone of the first point; None = degrees
+
+    Raises
+    ------
+    InputError : coordinates that are not known
+    """
+    if not isinstance(crs, str | None):
+        raise InputError(f"crs {crs!r}: expected text, such as EPSG:25832, or utm")
+    if crs is None:
+        return lon, lat, WGS84
+    import pyproj
+
+    if crs.lower() == "utm":
+        crs = f"EPSG:{326 if lat[0] >= 0 else 327}{int((lon[0] + 180.0) // 6.0) % 60 + 1:02d}"
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+        transform = pyproj.Transformer.from_crs(WGS84, crs, always_xy=True)
+    except pyproj.exceptions.CRSError:
+        raise InputError(f"crs {crs!r}: is not known; give one such as EPSG:25832, or utm") from None
+    if not (system.is_projected or system.is_geographic):
+        raise InputError(f"crs {crs!r}: {system.name} is no map's coordinates; give one such as EPSG:25832, or utm")
+    if system.area_of_use is not None and not _within(float(lon[0]), float(lat[0]), *system.area_of_use.bounds):
+        warn(f"crs {crs!r}: {system.name} is not made for {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
+    x, y = transform.transform(lon, lat)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise InputError(f"crs {crs!r}: does not reach to {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
+    return np.asarray(x), np.asarray(y), crs
+
+
+def _within(lon: float, lat: float, west: float, south: float, east: float, north: float) -> bool:
+    """Whether an area, which may lie across the date line, holds a place; all in degrees."""
+    return south <= lat <= north and (lon - west) % 360.0 <= ((east - west) % 360.0 or 360.0)
+
+
+def write_gpkg(track: Track, path: Path, options: ExportOptions) -> None:
+    """One file."""
+    write_layer(track, path, options, DRIVERS["gpkg"])
+
+
+def write_shp(track: Track, path: Path, options: ExportOptions) -> None:
+    """A folder with the parts of a shapefile."""
+    path.mkdir()
+    write_layer(track, path / "track.shp", options, DRIVERS["shp"])
+
+
+_GIS = (
+    ExportFormat("gpkg", "GeoPackage", ".gpkg", write_gpkg, "gis", needs_place=True),
+    ExportFormat("shp", "shapefile", "", write_shp, "gis", needs_place=True),
+)
+
+FORMATS = (*_GEOJSON, *_KML, *_GPX, *_GIS)

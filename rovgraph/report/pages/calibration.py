@@ -1,0 +1,157 @@
+"""Calibration: each variable against its prior, what is confused with what, what would help, and the biases."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.errors import InputError
+from rovgraph.inference.observability import data_information
+from rovgraph.lab.observability import in_words
+from rovgraph.log.units import shown
+from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import parse_config
+from rovgraph.report.colours import ESTIMATES
+from rovgraph.report.pages.page import Item, Missing, PageTable, Panel, Section, Trace, extremes, line
+from rovgraph.report.pages.source import DiveSource
+from rovgraph.report.units import plus_minus
+
+MOVED = 3.0  # prior sd beyond which a variable has moved suspiciously far
+
+
+def calibration_section(source: DiveSource) -> Section:
+    """Table, correlations, words, and histories."""
+    items: list[Item] = []
+    lead: list[str] = []
+    table = source.calibration
+    if table is None or table.empty:
+        items.append(Missing("Calibration against prior", "calibration.csv is missing or has no rows of this estimate"))
+    else:
+        items.append(_against_prior(table))
+    joint = ((source.summary.get("estimates") or {}).get(source.main.kind) or {}).get("calibration_covariance")
+    if isinstance(joint, dict):
+        lead += _words(joint)
+        items.append(correlation_table(joint["labels"], np.array(joint["covariance"], float)))
+    items += [*_histories(source), *_allan(source)]
+    return Section("calibration", "Calibration and biases", lead, items)
+
+
+def _against_prior(table: pd.DataFrame) -> PageTable:
+    held = (table["sd"] == 0) & (table["prior_sd"].fillna(0) == 0)
+    rows = []
+    for c in table[~held].to_dict("records"):
+        moved = c.get("moved_in_prior_sd")
+        flag = " (far)" if isinstance(moved, float) and abs(moved) > MOVED else ""
+        left = c.get("narrowing")
+        verdict = str(c.get("verdict") or "") if c.get("verdict") == c.get("verdict") else ""
+        rows.append(
+            (
+                str(c["label"]) + ("" if c["unit"] in ("1", 1) else f" [{c['unit']}]"),
+                plus_minus(c["prior_mean"], c["prior_sd"]),
+                plus_minus(c["value"], c["sd"]),
+                (f"{moved:+.2f}" if isinstance(moved, float) and np.isfinite(moved) else "–") + flag,
+                f"{100 * left:.0f} %" if isinstance(left, float) and np.isfinite(left) else "–",
+                verdict,
+                needs(str(c["label"])) if verdict in ("weak", "unobservable") else "",
+            )
+        )
+    head = ("variable", "prior", "after the dive", "moved [prior sd]", "sd left", "verdict", "what would help")
+    exact = ", ".join(table.loc[held, "label"].astype(str))
+    note = "± one standard deviation. considered: held, with its uncertainty in that of all else."
+    return PageTable("Calibration against prior", head, rows, note=note + (f" Exact: {exact}." if exact else ""))
+
+
+def needs(label: str) -> str:
+    """What a dive must have to show a component; empty where it is not known."""
+    return next((v.excited_by for v in TABLE.values() if label in v.labels), "")
+
+
+def _words(joint: dict[str, list[float]]) -> list[str]:
+    """What cannot be told apart, in the words of ``rovgraph observe``."""
+    labels = [str(label) for label in joint["labels"]]
+    prior, P = np.array(joint["prior_sd"], float), np.array(joint["covariance"], float)
+    if not (np.isfinite(P).all() and np.isfinite(prior).all() and (prior > 0).all()):
+        return []
+    try:
+        sentences = in_words(data_information(P, prior), labels, [unit_of(label) for label in labels], prior)
+    except np.linalg.LinAlgError:
+        return ["the covariance of the calibration is singular, so nothing is said of its combinations"]
+    return [sentence(s) for s in sentences]
+
+
+def sentence(words: str) -> str:
+    """With a capital, unless it begins with a variable's name, and a full stop."""
+    named = "_" in words.split(" ", 1)[0]
+    return (words if named else words[:1].upper() + words[1:]) + "."
+
+
+def unit_of(label: str) -> str:
+    """Unit of a component inside the program; "1" where it is not known."""
+    return next((v.unit for v in TABLE.values() if label in v.labels), "1")
+
+
+def correlation_table(labels: Sequence[str], covariance: np.ndarray) -> Item:
+    """A shaded matrix."""
+    title = "Correlations at the end of the dive"
+    sd = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(covariance).all() and (sd > 0).all()):
+        return Missing(title, "the covariance is not known")
+    rho = covariance / np.outer(sd, sd)
+    rows = [(label, *(float(r) for r in row)) for label, row in zip(labels, rho, strict=True)]
+    note = "Near ±1: the dive shows a combination of the two only."
+    return PageTable(title, ("", *labels), rows, note=note, shaded=True)
+
+
+def _allan(source: DiveSource) -> list[Item]:
+    """Allan deviations that the configuration states: N and K of sigma^2 = N^2 / tau + K^2 tau / 3."""
+    text = source.text("config.yaml")
+    if text is None or "imu" not in (source.summary.get("sensors") or {}):
+        return []
+    try:
+        noise = parse_config(text, "config.yaml").imu.noise
+    except InputError as error:
+        return [Missing("Allan deviation, as configured", str(error))]
+    tau = np.geomspace(0.01, max(source.clock.end - source.clock.start, 1.0), 100)
+    note = "Falling: noise of the samples. Rising: walk of the bias. Calibrate noise measures both."
+    items: list[Item] = []
+    for name, unit, density, walk in (
+        ("accelerometer", "m/s²", noise.acc, noise.acc_walk),
+        ("gyro", "rad/s", noise.gyr, noise.gyr_walk),
+    ):
+        drawn = [line("stated", tau, np.sqrt(density**2 / tau + walk**2 * tau / 3.0), ESTIMATES["smoothed"])]
+        labels = ("averaging time [s]", f"Allan deviation [{unit}]")
+        title = f"Allan deviation of the {name}, as configured"
+        items.append(Panel(title, *labels, drawn, kind="xy", note=note, log="xy", wide=False))
+    return items
+
+
+def _histories(source: DiveSource) -> list[Item]:
+    """Biases and calibration against time with bands of two sd."""
+    table = source.history
+    if table is None:
+        return [Missing("Biases", "the folder has no history.csv")]
+    items: list[Item] = []
+    for variable, own in table.groupby("variable", sort=False):
+        drawn: list[Trace] = []
+        unit = ""
+        for kind, rows in own.groupby("estimate", sort=False):
+            if kind not in ESTIMATES:
+                continue
+            factor, unit = shown(str(rows["unit"].iloc[0]))
+            time = source.clock(rows["time"].to_numpy(float))
+            value, sd = factor * rows["value"].to_numpy(float), factor * rows["sd"].to_numpy(float)
+            drawn += _band(str(kind), time, value, sd)
+        if drawn:
+            axis = str(variable) + ("" if unit in ("", "1") else f" [{unit}]")
+            items.append(Panel(str(variable), source.clock.label, axis, drawn, note="Bands: two standard deviations."))
+    return items
+
+
+def _band(kind: str, time: np.ndarray, value: np.ndarray, sd: np.ndarray) -> list[Trace]:
+    some = extremes(value, sd, stretches=250)
+    t, v, s, colour = time[some], value[some], sd[some], ESTIMATES[kind]
+    none = {"width": 0, "showlegend": False, "hoverinfo": "skip", "quiet": True}
+    low = line(kind, t, v - 2 * s, colour, **none)
+    high = line(kind, t, v + 2 * s, colour, fill="tonexty", fillcolor=colour + "26", **none)
+    middle = line(kind, t, v, colour, dash="solid" if kind == "smoothed" else "dash")
+    return [low, high, middle] if np.isfinite(s).any() else [middle]

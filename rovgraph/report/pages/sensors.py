@@ -1,0 +1,414 @@
+"""Sensors: the DVL, every sensor's residuals, the compasses, clocks and gaps.
+
+The beams of the DVL against time: how many of their pings were valid, and how far they reached.
+
+Compasses: residual against heading with the fitted deviation curve, and two compasses against each other.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.geometry import Array
+from rovgraph.log import Stream
+from rovgraph.log.beams import beam_numbers
+from rovgraph.model.calibration import TABLE
+from rovgraph.report.colours import REJECTED, SERIES
+from rovgraph.report.pages.page import (
+    Item,
+    Missing,
+    PageTable,
+    Panel,
+    Section,
+    Trace,
+    bars,
+    broken,
+    cloud,
+    extremes,
+    line,
+    packed,
+    points,
+    spread,
+)
+from rovgraph.report.pages.source import DiveSource, DiveTime
+
+BINS = 240  # of the dive; on a narrow screen a bin is hardly wider than a pixel
+PINGS = 4  # of a bin, at least, on the average
+HEIGHT = 0.8  # of a row, of the place that it has
+VALID, INVALID = "#0072B2", "#EDB48F"
+
+
+def beam_items(source: DiveSource, spans: Sequence[tuple[float, float, str]]) -> list[Item]:
+    """Valid pings and range of every beam.
+
+    Parameters
+    ----------
+    spans : from, to, colour: times that are shaded
+    """
+    title, beams, clock = "Valid pings of each beam", source.beams, source.clock
+    if beams is None:
+        return [Missing(title, "the folder has no dvl_beams.csv: the log's files do not tell beams apart")]
+    beams = beams.take((beams.time >= clock.start) & (beams.time <= clock.end))
+    if not len(beams):
+        return [Missing(title, "no ping of the beams lies within the track")]
+    return [_validity(title, beams, clock), *_ranges(beams, clock, spans)]
+
+
+def valid_share(beams: Stream, start: float, end: float) -> tuple[Array, Array]:
+    """How many pings of each beam were valid, over stretches of equal length.
+
+    Parameters
+    ----------
+    beams : of n pings and k beams, all of them between ``start`` and ``end``
+    start, end : of all stretches [s]
+
+    Returns
+    -------
+    edges : ndarray, shape (m + 1,), of the stretches [s]
+    share : ndarray, shape (m, k) [%]; NaN where there is no ping
+    """
+    valid = np.column_stack([beams[f"valid_{k}"] for k in beam_numbers(beams)])
+    edges = np.linspace(start, max(end, start + 1e-3), 1 + int(np.clip(len(beams) // PINGS, 1, BINS)))
+    place = np.clip(np.searchsorted(edges, beams.time, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(place, minlength=len(edges) - 1)
+    sums = np.column_stack([np.bincount(place, own, len(edges) - 1) for own in valid.T])
+    share = np.full(sums.shape, np.nan)
+    share[count > 0] = 100.0 * sums[count > 0] / count[count > 0, None]
+    return edges, share
+
+
+def _validity(title: str, beams: Stream, clock: DiveTime) -> Panel:
+    """A row for each beam, filled as high as its pings were valid."""
+    numbers = beam_numbers(beams)
+    names = [f"beam {number}" for number in numbers]
+    edges, share = valid_share(beams, clock.start, clock.end)
+    middle, width = clock(0.5 * (edges[1:] + edges[:-1])), float(edges[1] - edges[0]) / clock.scale
+    drawn: list[Trace] = []
+    for place, (name, own) in enumerate(zip(names, share.T, strict=True), 1):
+        foot, top = place + HEIGHT / 2, place - HEIGHT / 2  # places count downwards
+        up, down = -HEIGHT * own / 100.0, HEIGHT * (1.0 - own / 100.0)
+        drawn.append(bars(name, middle, up, VALID, width, base=foot, value=packed(own), showlegend=False))
+        look = {"base": top, "value": packed(100.0 - own), "showlegend": False, "hoverinfo": "skip", "quiet": True}
+        drawn.append(bars(f"{name}, not valid", middle, down, INVALID, width, **look))
+    means = ", ".join(
+        f"{name} {100.0 * beams[f'valid_{k}'].mean():.1f} %" for name, k in zip(names, numbers, strict=True)
+    )
+    note = (
+        f"Blue: valid, orange: not valid, white: no ping, in every {edges[1] - edges[0]:.2g} s. Valid of all: {means}."
+    )
+    return Panel(title, clock.label, "beam: valid pings [%]", drawn, note=note, names=numbers)
+
+
+def _ranges(beams: Stream, clock: DiveTime, spans: Sequence[tuple[float, float, str]]) -> list[Item]:
+    """Lines of all beams that have a range."""
+    drawn = []
+    for number, colour in zip(beam_numbers(beams), SERIES, strict=False):
+        far = beams[f"range_{number}"]
+        if np.isfinite(far).any():
+            some = extremes(far)
+            drawn.append(line(f"beam {number}", clock(beams.time[some]), far[some], colour))
+    note = "As the DVL states it: along the beam or straight down, by its maker."
+    return [Panel("Range of each beam", clock.label, "range [m]", drawn, note=note, spans=spans)] if drawn else []
+
+
+BLUE, RED, DARK = "#0072B2", "#D55E00", "#333333"
+LAGS = 60  # of an autocorrelation, in measurements
+POINTS = 2500  # of a cloud
+SHADE = "#B35900"
+
+
+def dvl_section(source: DiveSource) -> Section:
+    """Lock, altitude, beams, figure of merit, silences and velocities."""
+    title, clock, pings = "DVL", source.clock, source.pings
+    if pings is None:
+        return Section("dvl", title, (), [Missing("Pings", "the folder has no dvl.csv: no DVL, or an older version")])
+    time, lock = pings["time"].to_numpy(float), pings["lock"].to_numpy(float)
+    items: list[Item] = []
+    altitude = pings["altitude"].to_numpy(float)
+    spans = [(*clock(np.array(s)).tolist(), SHADE) for s in source.silences]
+    if np.isfinite(altitude).any():
+        drawn = [_over_time(source, "altitude", time, altitude)]
+        items.append(Panel("Altitude over the bottom", clock.label, "altitude [m]", drawn, spans=spans))
+    else:
+        items.append(Missing("Altitude over the bottom", "the log has no dvl_altitude"))
+    drawn = [_over_time(source, "bottom lock", time, lock, line_shape="hv")]
+    seen = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom" if len(lock) else "There is no ping"
+    note = f"{seen}; one that repeats the ping before it saw nothing. Shaded: silences."
+    items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans))
+    items += beam_items(source, spans)
+    items.append(_silences(time[lock == 1]))
+    items += _merit(source, pings)
+    items += _velocities(source, spans)
+    return Section("dvl", title, (), items)
+
+
+def _over_time(source: DiveSource, name: str, time: Array, values: Array, **look: str) -> Trace:
+    """A line over the page's clock that breaks in gaps."""
+    time, values = broken(time, values)
+    some = extremes(values)
+    return line(name, source.clock(time[some]), values[some], BLUE, **look)
+
+
+def _silences(locked: Array) -> Item:
+    title = "Silences: time between pings that saw the bottom"
+    gap = np.diff(locked)
+    gap = gap[gap > 0]
+    if not len(gap):
+        return Missing(title, "fewer than two pings saw the bottom")
+    edges = np.geomspace(gap.min() * 0.99, max(gap.max(), gap.min() * 1.1) * 1.01, 31)
+    count, _ = np.histogram(gap, edges)
+    x, y = np.repeat(edges, 2)[1:-1], np.repeat(count, 2).astype(float)
+    drawn = [line("count", x, np.where(y > 0, y, 0.5), BLUE, fill="tozeroy")]
+    return Panel(title, "time [s]", "count", drawn, kind="xy", log="xy", wide=False)
+
+
+def _merit(source: DiveSource, pings: pd.DataFrame) -> list[Item]:
+    """Figure of merit against the size of the residual."""
+    title, rows = "Figure of merit against residual", source.residuals
+    merit = pings.set_index("row")["figure_of_merit"]
+    if not merit.notna().any():
+        return [Missing(title, "the log has no dvl_sd")]
+    if rows is None or not (rows["sensor"] == "dvl").any():
+        return [Missing(title, "no ping was compared with the estimate")]
+    own = rows[rows["sensor"] == "dvl"]
+    size = np.sqrt((own["innovation"] ** 2).groupby(own["row"]).mean())
+    when = own.groupby("row")["time"].first()
+    both = pd.DataFrame({"merit": merit[~merit.index.duplicated()], "size": size, "time": when}).dropna()
+    some = spread(len(both), POINTS)
+    both = both.iloc[some]
+    drawn = [points("ping", both["merit"], both["size"], BLUE, size=3, t=packed(source.clock(both["time"].to_numpy())))]
+    top = float(both["merit"].max()) if len(both) else 1.0
+    drawn.append(line("equal", [0, top], [0, top], DARK, dash="dot"))
+    labels = ("figure of merit [m/s]", "rms residual of a ping [m/s]")
+    return [Panel(title, *labels, drawn, kind="xy", note="Above the line: worse than the DVL says.", wide=False)]
+
+
+def _velocities(source: DiveSource, spans: list[tuple[float, float, str]]) -> list[Item]:
+    rows = source.residuals
+    if rows is None or not {"measured", "predicted"} <= set(rows.columns):
+        return [Missing("Velocities", "residuals.csv is missing or incomplete")]
+    items: list[Item] = []
+    for component, own in rows[rows["sensor"] == "dvl"].groupby("component", sort=False):
+        time, measured = own["time"].to_numpy(float), own["measured"].to_numpy(float)
+        some = cloud(measured)
+        drawn = [
+            points("measured", source.clock(time[some]), measured[some], "#7A7A7A", size=3),
+            _over_time(source, source.main.name, time, own["predicted"].to_numpy(float)),
+        ]
+        title = f"Velocity along the DVL's {component} axis"
+        items.append(Panel(title, source.clock.label, f"v_{component} [m/s]", drawn, spans=spans))
+    return items
+
+
+def residuals_section(source: DiveSource) -> Section:
+    """Normalised residuals against time, their histogram and autocorrelation, and what was rejected."""
+    lead = [
+        "Measured minus predicted, over the expected sd. About 1 in 370 should lie beyond ±3, the histogram should "
+        "follow the normal curve, and the autocorrelation should stay in its band: errors that last break it."
+    ]
+    items: list[Item] = [_left_out(source)]
+    rows = source.residuals
+    if rows is None:
+        items.append(Missing("Residuals", "the folder has no residuals.csv"))
+    elif rows.empty:
+        items.append(Missing("Residuals", "no measurement was compared with the estimate"))
+    else:
+        for (sensor, component), own in rows.groupby(["sensor", "component"], sort=False):
+            items += _residual_panels(source, f"{sensor} {component}", own)
+    return Section("residuals", "Residuals", lead, items)
+
+
+def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterator[Item]:
+    time, z = source.clock(own["time"].to_numpy(float)), own["normalised"].to_numpy(float)
+    used = own["weight"].to_numpy(float) > 0
+    drawn = []
+    for label, mask, colour in (("used", used, BLUE), ("rejected", ~used, REJECTED)):
+        t, values = time[mask], z[mask]
+        if len(values):
+            some = cloud(values)
+            drawn.append(points(f"{label} ({len(values)})", t[some], values[some], colour, size=3))
+    reach = 1.1 * max(float(np.nanmax(np.abs(z[used]), initial=0.0)), 5.0)
+    beyond = int(np.count_nonzero(np.abs(z) > reach))
+    note = f"{beyond} lie beyond what is shown: a double click shows all." if beyond else ""
+    labels = (source.clock.label, "residual / sd")
+    yield Panel(f"{name}: residual", *labels, drawn, note=note, levels=(-3.0, 0.0, 3.0), reach=reach)
+    fitted = z[used & np.isfinite(z)]
+    if len(fitted) < 2:
+        yield Missing(f"{name}: distribution", "fewer than two measurements were used")
+        return
+    edges = np.linspace(-5.0, 5.0, 51)
+    count, _ = np.histogram(np.clip(fitted, -4.999, 4.999), edges)
+    centre, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
+    normal = np.exp(-0.5 * centre**2) / np.sqrt(2 * np.pi)
+    drawn = [bars("measured", centre, count / (len(fitted) * width), "#8FBBD9", float(width))]
+    drawn.append(line("normal", centre, normal, RED))
+    note = f"rms {np.sqrt(np.mean(fitted**2)):.2f}, 1 where the noise is as stated. The outer bars hold what is beyond."
+    labels = ("residual / sd", "density")
+    yield Panel(f"{name}: distribution", *labels, drawn, kind="xy", note=note, wide=False)
+    yield _autocorrelation(name, fitted)
+
+
+def _autocorrelation(name: str, z: Array) -> Item:
+    rho = autocorrelation(z, LAGS)
+    band = 2.0 / np.sqrt(len(z))
+    drawn = [bars("autocorrelation", np.arange(1, len(rho) + 1), rho, "#8FBBD9", 0.8)]
+    labels = ("lag [measurements]", "autocorrelation")
+    note = "Between the lines: 95 % of white noise."
+    return Panel(f"{name}: autocorrelation", *labels, drawn, kind="xy", levels=(-band, band), note=note, wide=False)
+
+
+def autocorrelation(z: Array, lags: int) -> Array:
+    """Of lags 1 to ``lags`` or fewer, of a series less its mean; zero where it does not vary."""
+    centred = z - z.mean()
+    n, lags = len(z), min(lags, len(z) - 1)
+    size = 1 << (2 * n - 1).bit_length()
+    power = np.abs(np.fft.rfft(centred, size)) ** 2
+    covariance = np.fft.irfft(power, size)[: lags + 1]
+    return np.asarray(covariance[1:] / covariance[0] if covariance[0] > 0 else np.zeros(lags))
+
+
+def _left_out(source: DiveSource) -> Item:
+    title = "Measurements that did not count"
+    table = source.frame("left_out.csv", "time", "sensor", "reason", "row")
+    if table is None:
+        return Missing(title, "the folder has no left_out.csv")
+    rows = []
+    for (sensor, reason), own in table.groupby(["sensor", "reason"], sort=True):
+        first, last = source.clock(own["time"].to_numpy(float))[[0, -1]]
+        lines = ", ".join(str(r) for r in own["row"].head(5)) + ("…" if len(own) > 5 else "")
+        rows.append((str(sensor), str(reason), str(len(own)), f"{first:.1f}", f"{last:.1f}", lines))
+    unit = source.clock.unit
+    head = ("sensor", "reason", "count", f"first [{unit}]", f"last [{unit}]", "lines of the log")
+    return PageTable(title, head, rows, note="" if rows else "Every measurement was used.")
+
+
+def clocks_section(source: DiveSource) -> Section:
+    """Rates, gaps and jitter of every sensor."""
+    head = ("sensor", "recorded", "used", "rejected", "rate [Hz]", "from [s]", "to [s]", "longest gap [s]", "at [s]",
+            "jitter [s]", "repeats")  # fmt: skip
+    keys = ("recorded", "used", "rejected", "rate_hz", "from_s", "to_s", "longest_gap_s", "longest_gap_at_s",
+            "jitter_s", "repeats")  # fmt: skip
+    rows = []
+    for sensor, numbers in (source.summary.get("sensors") or {}).items():
+        cells = [numbers.get(key) for key in keys]
+        rows.append(
+            (str(sensor), *("–" if c is None else f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells))
+        )
+    note = (
+        "Times count from the first measurement of the log. Jitter: half the width of the middle 90 % of the periods."
+    )
+    items: list[Item] = [PageTable("Clocks, rates and gaps", head, rows, note=note), *_periods(source)]
+    return Section("clocks", "Clocks and gaps", (), items)
+
+
+def _periods(source: DiveSource) -> list[Item]:
+    """Time between measurements that were compared with the estimate."""
+    rows = source.residuals
+    if rows is None or rows.empty:
+        return []
+    drawn: list[Trace] = []
+    for k, (sensor, own) in enumerate(rows.groupby("sensor", sort=False)):
+        time = np.unique(own["time"].to_numpy(float))
+        if len(time) > 1:
+            period = np.diff(time)
+            some = extremes(period)
+            drawn.append(line(str(sensor), source.clock(time[1:])[some], period[some], SERIES[k % len(SERIES)]))
+    if not drawn:
+        return []
+    note = "One keyframe takes one heading, so a compass shows the rate of the keyframes here."
+    return [Panel("Time between measurements used", source.clock.label, "period [s]", drawn, note=note, log="y")]
+
+
+CURVES = {v.sensors[0]: name for name, v in TABLE.items() if name.endswith("_deviation")}  # sensor -> its curve
+MOST = 3000
+ALL_ROUND = np.linspace(0.0, 360.0, 181)
+
+
+def compass_section(source: DiveSource) -> Section:
+    """Every compass that was compared with the estimate."""
+    rows = source.residuals
+    title = "Compasses"
+    if rows is None:
+        return Section("compasses", title, (), [Missing("Deviation", "the folder has no residuals.csv")])
+    headings = rows[(rows["component"] == "heading") & (rows["weight"] > 0)]
+    items: list[Item] = [_deviation(source, str(s), own) for s, own in headings.groupby("sensor", sort=False)]
+    if not items:
+        items = [Missing("Deviation", "no compass that measures a heading was used; a magnetometer is in Residuals")]
+    measured = {str(s): own for s, own in headings.groupby("sensor", sort=False)} if "measured" in rows else {}
+    items += [_pair(source, a, measured[a], b, measured[b]) for a, b in combinations(measured, 2)]
+    return Section("compasses", title, ["A wave with one period per turn is deviation."], items)
+
+
+def _heading(source: DiveSource, time: Array) -> Array:
+    """Heading of the main track at some times, in [0, 360) [deg]."""
+    yaw = source.main["yaw"]
+    known = np.isfinite(yaw)
+    if not known.any():
+        return np.full(len(time), np.nan)
+    return np.asarray(np.rad2deg(np.interp(time, source.main["time"][known], np.unwrap(yaw[known]))) % 360.0)
+
+
+def _deviation(source: DiveSource, sensor: str, own: pd.DataFrame) -> Item:
+    """Residual against the heading of the compass's own axis, with the fitted curve added back."""
+    own = own.iloc[spread(len(own), MOST)]
+    time = own["time"].to_numpy(float)
+    residual = np.rad2deg(own["innovation"].to_numpy(float))
+    look = {"size": 3, "t": packed(source.clock(time))}
+    title = f"{sensor}: deviation against heading"
+    fit = _fit(source, sensor)
+    if fit is None or "predicted" not in own:
+        drawn = [points("residual", _heading(source, time), residual, "#0072B2", **look)]
+        note = "No deviation curve was estimated."
+        return Panel(title, "heading [°]", "residual [°]", drawn, kind="xy", note=note, wide=False)
+    offset, sine, cosine = fit
+    heading = np.rad2deg(own["predicted"].to_numpy(float)) - offset
+    for _ in range(5):  # predicted = heading + offset + deviation(heading)
+        heading = np.rad2deg(own["predicted"].to_numpy(float)) - offset - _curve(sine, cosine, heading)
+    heading %= 360.0
+    drawn = [
+        points("compass less offset", heading, residual + _curve(sine, cosine, heading), "#0072B2", **look),
+        line("fitted deviation", ALL_ROUND, _curve(sine, cosine, ALL_ROUND), "#D55E00", width=2.5),
+        points("residual after the fit", heading, residual, "#8A8A8A", visible="legendonly", **look),
+    ]
+    note = f"Deviation: {sine:.2f}° sin h + {cosine:.2f}° cos h, h the heading of the compass's own axis."
+    return Panel(title, "heading of the compass [°]", "deviation [°]", drawn, kind="xy", note=note, wide=False)
+
+
+def _curve(sine: float, cosine: float, heading: Array) -> Array:
+    """Deviation at a heading [deg]."""
+    return np.asarray(sine * np.sin(np.deg2rad(heading)) + cosine * np.cos(np.deg2rad(heading)))
+
+
+def _fit(source: DiveSource, sensor: str) -> tuple[float, float, float] | None:
+    """Offset, and coefficients of sine and cosine of the heading [deg], where a curve was estimated."""
+    table, name = source.calibration, CURVES.get(sensor)
+    if table is None or name is None:
+        return None
+    value = table.set_index("label")["value"]
+    if not {f"{name}_sin", f"{name}_cos"} <= set(value.index):
+        return None
+    labels = (name.replace("deviation", "offset"), f"{name}_sin", f"{name}_cos")
+    offset, sine, cosine = (float(value.get(label, 0.0)) for label in labels)
+    return (offset, sine, cosine) if np.isfinite([offset, sine, cosine]).all() and (sine or cosine) else None
+
+
+def _pair(source: DiveSource, a: str, first: pd.DataFrame, b: str, second: pd.DataFrame) -> Item:
+    """The difference of two compasses as recorded, against heading."""
+    title = f"{a} minus {b}, as recorded"
+    left = first[["time", "measured"]].sort_values("time")
+    right = second[["time", "measured"]].sort_values("time")
+    both = pd.merge_asof(left, right, on="time", direction="nearest", tolerance=0.5, suffixes=("_a", "_b"))  # type: ignore[arg-type]
+    both = both.dropna()
+    if both.empty:
+        return Missing(title, "they never measured within half a second of each other")
+    both = both.iloc[spread(len(both), MOST)]
+    angle = (both["measured_a"] - both["measured_b"]).to_numpy(float)
+    middle = np.angle(np.mean(np.exp(1j * angle)))
+    difference = np.rad2deg(middle + np.angle(np.exp(1j * (angle - middle))))
+    time = both["time"].to_numpy(float)
+    look = {"size": 3, "t": packed(source.clock(time))}
+    drawn = [points("difference", _heading(source, time), difference, "#0072B2", **look)]
+    note = f"Mean {np.rad2deg(middle):.1f}°: mountings and offsets together."
+    return Panel(title, "heading [°]", "difference [°]", drawn, kind="xy", note=note, wide=False)

@@ -1,0 +1,164 @@
+"""The track seen from above: estimates, fixes, ellipses, silences, and what the cursor needs to find the vehicle."""
+
+import html
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pymap3d.rcurve import meridian, transverse
+
+from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
+from rovgraph.report.pages.page import Item, Missing, Panel, Section, Trace, extremes, line, packed, points, spread
+from rovgraph.report.pages.source import KINDS, DiveSource, PageTrack
+
+ELLIPSES = 24
+SPACED = np.linspace(0.0, 2 * np.pi, 41)
+SILENT, MARK = "#B35900", "#6A3D9A"
+POLAR_DEG = 89.0  # beyond it a degree of longitude is no length to draw with
+
+
+def track_section(source: DiveSource) -> Section:
+    """The map."""
+    lead = ["North is up. Move the slider below or the mouse over any plot: the arrow shows where the vehicle was."]
+    if source.summary.get("origin") is None:
+        lead.append("Latitude and longitude are not known: the log has no fix_lat, the configuration no origin.")
+    lead += [f"The folder has no {kind.replace('_', ' ')} track." for kind in KINDS if kind not in source.tracks]
+    if source.residuals is None:
+        lead.append("residuals.csv is missing, so fixes cannot be shown.")
+    elif not (source.residuals["sensor"] == "fix").any():
+        lead.append("The dive has no position fixes.")
+    traces = [
+        *_lines(source),
+        *_silent(source),
+        *_fixes(source.residuals, source),
+        *_ellipses(source.main),
+        *_ends(source),
+        *_marks(source.frame("marks.csv", "name", "north", "east")),
+    ]
+    note = "Ellipses hold 99 %. The thick line marks parts without bottom lock."
+    chart: Item = Panel("Track", "east [m]", "north [m]", traces, kind="map", note=note)
+    if not np.isfinite(source.main["north"]).any():
+        chart = Missing("Track", "the trajectory holds no known position")
+    return Section("track", "Track", lead, [chart])
+
+
+def cursor(source: DiveSource) -> dict[str, Any]:
+    """The main track at the times that the slider can stand at, for ``page.js``."""
+    track, clock = source.main, source.clock
+    some = _thinned(track)
+    major, minor, bearing = track.ellipses
+    found: dict[str, Any] = {
+        "time": packed(clock(track["time"][some])),
+        "north": packed(track["north"][some]),
+        "east": packed(track["east"][some]),
+        "down": packed(track["down"][some]),
+        "yaw": packed(np.unwrap(track["yaw"][some]) if np.isfinite(track["yaw"][some]).all() else track["yaw"][some]),
+        "major": packed(major[some]),
+        "minor": packed(minor[some]),
+        "bearing": packed(bearing[some]),
+    }
+    return found
+
+
+def origin(source: DiveSource) -> dict[str, float] | None:
+    """Latitude and longitude of north = east = 0 and metres of a degree of each; None if not known, or polar."""
+    place = source.summary.get("origin")
+    if not isinstance(place, dict) or not all(isinstance(place.get(k), int | float) for k in ("lat_deg", "lon_deg")):
+        return None
+    lat = float(place["lat_deg"])
+    if not abs(lat) <= POLAR_DEG:
+        return None
+    degree = np.deg2rad(1.0)
+    metres = {
+        "lat_m": float(meridian(lat) * degree),
+        "lon_m": float(transverse(lat) * np.cos(np.deg2rad(lat)) * degree),
+    }
+    return {"lat": lat, "lon": float(place["lon_deg"]), **metres}
+
+
+def _thinned(track: PageTrack) -> NDArray[np.intp]:
+    return extremes(track["north"], track["east"])
+
+
+def _lines(source: DiveSource) -> list[Trace]:
+    dashes = {"smoothed": "solid", "filtered": "dash", "dead_reckoning": "dot"}
+    drawn = []
+    for kind, track in reversed(source.tracks.items()):
+        some = _thinned(track)
+        look = {"dash": dashes[kind], "width": 2.0 if kind == source.main.kind else 1.3}
+        when = packed(source.clock(track["time"][some]))
+        drawn.append(line(track.name, track["east"][some], track["north"][some], ESTIMATES[kind], t=when, **look))
+    return drawn
+
+
+def _silent(source: DiveSource) -> list[Trace]:
+    track = source.main
+    if not source.silences:
+        return []
+    parts = []
+    for begin, end in source.silences:
+        inside = np.flatnonzero((track["time"] >= begin) & (track["time"] <= end))
+        if len(inside) > 1:
+            parts.append(inside[spread(len(inside), 60)])
+    if not parts:
+        return []
+    east, north = (np.concatenate([np.append(track[c][p], np.nan) for p in parts]) for c in ("east", "north"))
+    return [line("no bottom lock", east, north, SILENT, width=5, opacity=0.55, hoverinfo="skip")]
+
+
+def _fixes(rows: pd.DataFrame | None, source: DiveSource) -> list[Trace]:
+    if rows is None or "measured" not in rows:
+        return []
+    fixes = rows[rows["sensor"] == "fix"]
+    if fixes.empty:
+        return []
+    both = fixes.pivot_table(index=["time", "row"], columns="component", values=["measured", "weight"], dropna=False)
+    if not {("measured", "north"), ("measured", "east")} <= set(both.columns):
+        return []
+    north, east = (both["measured"][c].to_numpy(float) for c in ("north", "east"))
+    weight = both["weight"].to_numpy(float).min(axis=1)
+    time = source.clock(both.index.get_level_values("time").to_numpy(float))
+    drawn = []
+    for name, mask, colour, symbol in (
+        ("fix, used", weight > 0, USED, "cross-thin-open"),
+        ("fix, rejected", weight <= 0, REJECTED, "x-thin-open"),
+    ):
+        some = np.flatnonzero(mask)
+        if len(some):
+            some = some[spread(len(some), 1500)]
+            look = {"size": 6, "symbol": symbol, "t": packed(time[some])}
+            drawn.append(points(f"{name} ({int(mask.sum())})", east[some], north[some], colour, **look))
+    return drawn
+
+
+def _ellipses(track: PageTrack) -> list[Trace]:
+    """99 % ellipses along the track as one line with gaps."""
+    major, minor, bearing = track.ellipses
+    known = np.flatnonzero(np.isfinite(major) & np.isfinite(track["north"]))
+    if not len(known):
+        return []
+    some = known[spread(len(known), ELLIPSES)]
+    a, b = major[some, None] * np.cos(SPACED), minor[some, None] * np.sin(SPACED)
+    c, s = np.cos(bearing[some, None]), np.sin(bearing[some, None])
+    gap = np.full((len(some), 1), np.nan)
+    north = np.hstack([track["north"][some, None] + c * a - s * b, gap]).ravel()
+    east = np.hstack([track["east"][some, None] + s * a + c * b, gap]).ravel()
+    return [line(f"99 %, {track.name}", east, north, OTHER, width=0.9, hoverinfo="skip")]
+
+
+def _ends(source: DiveSource) -> list[Trace]:
+    track = source.main
+    ends = (("start", 0, "circle-open"), ("end", -1, "square"))
+    look = [(name, track["east"][i], track["north"][i], symbol) for name, i, symbol in ends]
+    return [points(name, [e], [n], "#000000", size=9, symbol=symbol, hoverinfo="name") for name, e, n, symbol in look]
+
+
+def _marks(rows: pd.DataFrame | None) -> list[Trace]:
+    """What a person marked during the dive, with the names."""
+    if rows is None or rows.empty:
+        return []
+    north, east = (pd.to_numeric(rows[c], errors="coerce").to_numpy(float) for c in ("north", "east"))
+    names = [html.escape(str(name)) for name in rows["name"].fillna("")]  # Plotly reads tags in a text
+    look: dict[str, Any] = {"mode": "markers+text", "text": names, "textposition": "top right", "hoverinfo": "text"}
+    return [points("mark", east, north, MARK, size=9, symbol="triangle-up", **look)]

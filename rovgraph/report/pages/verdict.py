@@ -1,0 +1,289 @@
+"""The verdict in words for a person who knows nothing of filters: how good, what limits it, what to do next time.
+
+Sources of variance in groups that a person can do something about.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rovgraph.report.pages.page import PageTable, Section
+from rovgraph.report.pages.source import DiveSource, PageTrack
+from rovgraph.report.units import plus_minus
+
+HEADING = (
+    *("mag", "ahrs", "dvl_heading", "vehicle_heading", "hard_iron", "soft_iron", "field_"),
+    *("dvl_compass", "vehicle_compass", "start attitude"),
+)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A group of sources.
+
+    Attributes
+    ----------
+    sources : how their names in summary.json begin; a source belongs to the first group that has it
+    text : what limits, in words
+    advice : what to do next time
+    known : whether no way travelled adds to it: it stands whatever the DVL sees
+    """
+
+    sources: tuple[str, ...]
+    text: str
+    advice: str
+    known: bool = False
+
+
+CAUSES = (
+    Cause(
+        ("start position",),
+        "the position at the start",
+        "take a position fix at the start, or state start.position_sd_m where it is known better",
+        known=True,
+    ),
+    Cause(("fix",), "the position fixes", "take better fixes, or state fix.sd_m where they are better", known=True),
+    Cause(
+        HEADING,
+        "the heading (compasses and their calibration)",
+        "turn two full circles in calm water to show the compasses, and calibrate the magnetometer",
+    ),
+    Cause(
+        ("dvl_yaw", "dvl_roll", "dvl_pitch"),
+        "the mounting of the DVL",
+        "take position fixes at both ends of a long straight line, or measure the mounting and state its sd",
+    ),
+    Cause(
+        ("dvl_scale",),
+        "the scale of the DVL",
+        "take position fixes at both ends of a long straight line, and state the sound speed",
+    ),
+    Cause(
+        ("dvl",),
+        "the small errors of the DVL's velocity, which add up over the way",
+        "take a position fix now and then, or pass a place twice that a camera or a sonar recognises",
+    ),
+    Cause(
+        ("imu", "gyr", "acc", "start bias", "start velocity"),
+        "the noise and biases of the inertial unit",
+        "use a DVL throughout or take position fixes more often, and state the unit's noise (rovgraph calibrate noise)",
+    ),
+    Cause(
+        ("thruster", "drag", "current"),
+        "the current and the model of the thrusters",
+        "keep a DVL's bottom lock, or take position fixes more often",
+    ),
+)
+
+
+def largest_cause(sources: Mapping[str, float]) -> tuple[Cause, float] | None:
+    """The group that brings the most, and its share; None where the sources have no variance or no group."""
+    total, found = sum(sources.values()), dict.fromkeys(CAUSES, 0.0)
+    for name, variance in sources.items():
+        cause = next((c for c in CAUSES if name.startswith(c.sources)), None)
+        if cause is not None:
+            found[cause] += variance
+    cause = max(CAUSES, key=found.__getitem__)
+    return (cause, found[cause] / total) if found[cause] > 0 else None
+
+
+ALIKE = 0.97  # a radius at the end of this part of the largest is said once
+LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
+MOST = 0.5  # of the variance: where that much is older than the way since the last fix, the way is not what limits
+SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
+
+GOOD = {
+    "trusted": "Nothing in the log contradicts this track.",
+    "doubtful": "Use this track with care: something in the log does not fit.",
+    "wrong": "Do not use this track: the sensors contradict each other.",
+}
+
+
+def verdict_section(source: DiveSource) -> Section:
+    """Verdict, what limits the track, advice, alarms, assumptions and warnings."""
+    summary = source.summary
+    alarms = [f"{a.get('severity', '')}: {a.get('text', '')}" for a in summary.get("alarms") or []]
+    lists = {
+        "Alarms": alarms,
+        "Warnings about the log": summary.get("warnings") or [],
+        "Assumed, because neither log nor configuration said": summary.get("assumptions") or [],
+        "Advice: no evidence of error": [str(a.get("text", "")) for a in summary.get("advice") or []],
+    }
+    notes = [source.other_version] if source.other_version else []
+    lead = [how_good(source), *limits(source), *notes]
+    title = f"Verdict: {summary.get('verdict', 'unknown')}"
+    return Section("verdict", title, lead, [_numbers(source)], {k: v for k, v in lists.items() if v})
+
+
+def how_good(source: DiveSource) -> str:
+    """The verdict and how far off the vehicle may be, in a sentence or two."""
+    words = GOOD.get(str(source.summary.get("verdict")), "The verdict is not known.")
+    if source.summary.get("verdict") == "wrong":
+        return words  # its standard deviations are those of a dive that did not happen
+    reach = source.main.ellipses[0]
+    if not np.isfinite(reach).any():
+        return f"{words} How far it may be off is not known."
+    worst = int(np.nanargmax(reach))
+    clock = source.clock
+    when = clock(source.main["time"][worst : worst + 1])[0]
+    limit = f"99 times in 100 the vehicle was within {_metres(reach[worst])} of it at the worst moment"
+    trusted = words if source.summary.get("verdict") == "trusted" else f"{words} If the noise is as stated,"
+    last = reach[-1] > ALIKE * reach[worst]
+    moment = "the end" if last else f"{when:.0f} {clock.unit} after the start"
+    further = f", and within {_metres(reach[-1])} at the end" if not last and np.isfinite(reach[-1]) else ""
+    return f"{trusted} {limit} ({moment}){further}."
+
+
+def limits(source: DiveSource) -> list[str]:
+    """What limits the track, and what to do next time."""
+    cause, advice = _cause(source)
+    if not cause:
+        return []
+    return [f"What limits it: {cause}.", f"Next time: {advice}."]
+
+
+def _cause(source: DiveSource) -> tuple[str, str]:
+    """The largest cause of uncertainty, read from the estimate's own covariance, and its remedy."""
+    alarms = source.summary.get("alarms") or []
+    if source.summary.get("verdict") == "wrong" and alarms:
+        text = str(alarms[0].get("text", ""))
+        cause, _, remedy = text.partition("; ")
+        return cause, remedy or "see the alarms below"
+    track = source.main
+    if not np.isfinite(track.horizontal_sd).any() or len(track) < 3:
+        return "", ""
+    found = largest_cause(_variance_sources(source))
+    silent = _share_in_silence(source, track)
+    if silent > 0.5 and not (found and found[0].known):
+        return (
+            f"{100 * silent:.0f} % of what the variance grew fell into times without a velocity from the DVL",
+            "keep the DVL within its range of the bottom and see that it records throughout, or take a position fix "
+            "after each silence",
+        )
+    if found:
+        limit, share = found
+        return f"{limit.text}: {100 * share:.0f} % of the position's variance where it is largest", limit.advice
+    return _by_direction(source)
+
+
+def _variance_sources(source: DiveSource) -> dict[str, float]:
+    """Source -> variance [m^2], as the estimate found it; empty where it did not."""
+    estimate = (source.summary.get("estimates") or {}).get(source.main.kind) or {}
+    found = estimate.get("variance_sources") or {}
+    return {str(name): float(variance) for name, variance in (found.get("m2") or {}).items()}
+
+
+def _share_in_silence(source: DiveSource, track: PageTrack) -> float:
+    """Share of the growth of the horizontal variance that fell into silences of the DVL."""
+    growth = np.clip(np.diff(track.horizontal_sd**2, prepend=np.nan), 0.0, None)
+    growth[~np.isfinite(growth)] = 0.0
+    time = track["time"]
+    inside = np.zeros(len(track), bool)
+    for begin, end in source.silences:
+        inside |= (time > begin) & (time <= end)
+    total = float(growth.sum())
+    return float(growth[inside].sum()) / total if total > 0 else 0.0
+
+
+def _by_direction(source: DiveSource) -> tuple[str, str]:
+    """Whether heading or speed limits: the sd across and along the way since the last fix."""
+    main = source.main
+    reach = main.ellipses[0]
+    worst = int(np.nanargmax(reach))
+    origin = _last_fix_before(source, main["time"][worst])
+    ahead = np.array([main["north"][worst] - main["north"][origin], main["east"][worst] - main["east"][origin]])
+    distance = float(np.hypot(*ahead))
+    steps = np.hypot(np.diff(main["north"][origin : worst + 1]), np.diff(main["east"][origin : worst + 1]))
+    since = "the last position fix" if origin else "the start"
+    known = float(main.horizontal_sd[origin])
+    if known**2 > MOST * main.horizontal_sd[worst] ** 2:
+        return _position_there(source, known, since)
+    if not {"dvl", "dvl_water"} & _used(source):
+        return (
+            f"the errors of the inertial unit, which grow fast since {since}, as no DVL was used",
+            "use a DVL, or take position fixes more often",
+        )
+    noise = (
+        f"the small errors of the DVL's velocity, which add up over the way since {since}",
+        "take a position fix now and then, or pass a place twice that a camera or a sonar recognises",
+    )
+    if distance < max(SHORT * float(np.nansum(steps)), 1.0):
+        return noise
+    u = ahead / distance
+    cov = main["cov_north_east"][worst]
+    cov = 0.0 if np.isnan(cov) else cov
+    P = np.array([[main["north_sd"][worst] ** 2, cov], [cov, main["east_sd"][worst] ** 2]])
+    across, along = (float(np.sqrt(max(d @ P @ d, 0.0))) for d in (np.array([-u[1], u[0]]), u))
+    if across > LOPSIDED * along:
+        return (
+            f"the direction of travel (compass and mounting of the DVL), known to {np.rad2deg(across / distance):.1f}° "
+            f"over the {distance:.0f} m from {since}",
+            "take position fixes at both ends of a long straight line, and turn two full circles to show the compasses",
+        )
+    if along > LOPSIDED * across:
+        return (
+            f"the distance travelled (scale of the DVL), known to {100 * along / distance:.1f} % "
+            f"over the {distance:.0f} m from {since}",
+            "take position fixes at both ends of a long straight line, and state the sound speed",
+        )
+    return noise
+
+
+def _position_there(source: DiveSource, known: float, since: str) -> tuple[str, str]:
+    """Where most of the uncertainty stood at the last fix, or at the start, already."""
+    if since == "the start":
+        return (
+            f"the position at the start, known to {_metres(known)} (one standard deviation)",
+            "take a position fix at the start, or state start.position_sd_m where it is known better",
+        )
+    return (
+        f"the position fixes, which give the position to {_metres(known)} (one standard deviation)",
+        "take better fixes, or state fix.sd_m where they are better than that",
+    )
+
+
+def _used(source: DiveSource) -> set[str]:
+    """Sensors of which a measurement counted; all that the summary names where residuals are missing."""
+    rows = source.residuals
+    return {*(source.summary.get("sensors") or {})} if rows is None else {*rows.loc[rows["weight"] > 0, "sensor"]}
+
+
+def _last_fix_before(source: DiveSource, time: float) -> int:
+    """Index of the epoch of the last fix that counted, 0 where there was none."""
+    rows = source.residuals
+    if rows is None:
+        return 0
+    fixes = rows.loc[(rows["sensor"] == "fix") & (rows["weight"] > 0) & (rows["time"] < time), "time"]
+    return int(np.searchsorted(source.main["time"], fixes.iloc[-1])) if len(fixes) else 0
+
+
+def _numbers(source: DiveSource) -> PageTable:
+    """The dive in numbers."""
+    s = source.summary
+    end: dict[str, Any] = s.get("end") or {}
+
+    def value(key: str, unit: str) -> str:
+        number = s.get(key)
+        return f"{number:.4g} {unit}" if isinstance(number, int | float) else "unknown"
+
+    def with_sd(name: str, unit: str) -> str:
+        short = {"m": "m", "°": "deg"}[unit]
+        number, sd = end.get(f"{name}_{short}"), end.get(f"{name}_sd_{short}")
+        return plus_minus(np.nan if number is None else number, np.nan if sd is None else sd, unit)
+
+    rows = [
+        ("log", str(s.get("log", "unknown"))),
+        ("duration", value("duration_s", "s")),
+        ("distance", value("distance_m", "m")),
+        ("end, north", with_sd("north", "m")),
+        ("end, east", with_sd("east", "m")),
+        ("end, down", with_sd("down", "m")),
+        ("end, heading", with_sd("heading", "°")),
+    ]
+    return PageTable(f"The dive in numbers, {source.main.name}, ± one standard deviation", ("", ""), rows)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2g} m" if value < 10 else f"{value:.0f} m"

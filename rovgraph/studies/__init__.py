@@ -1,1 +1,0 @@
-"""Studies: many dives, many estimators."""
