@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rovgraph.errors import InputError, as_path, as_texts, kind_of
 from rovgraph.log.tables import read_cells
-from rovgraph.report.export import Options, Tagged, Track, read_track, write_track
+from rovgraph.report.export import ExportOptions, Tagged, Track, read_track, write_track
 from rovgraph.report.export import tag as tag_table
 from rovgraph.report.export.tagging import column_of, geotag
 
@@ -55,7 +55,7 @@ def export(
         if not isinstance(results, str | Path):
             raise InputError("out: expected a folder to write into, because these results have none")
         out = results
-    return write_track(track, as_texts(to, "to"), as_path(out, "out"), Options(rate, crs), force)
+    return write_track(track, as_texts(to, "to"), as_path(out, "out"), ExportOptions(rate, crs), force)
 
 
 def tag(
