@@ -27,7 +27,7 @@ from rovgraph.model.config import Config, beliefs, load_config
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import write_log
 
-FALCON = Path(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml"
+FALCON = Path(__file__).parents[1] / "rovgraph" / "model" / "falcon.yaml"
 IMU_RATE, DVL_RATE = 100.0, 5.6
 
 

@@ -63,7 +63,8 @@ class Checkout:
     @property
     def falcon(self) -> Path:
         """The configuration of the simulated dives."""
-        return self.root / "rovgraph" / "config" / "falcon.yaml"
+        (found,) = self.root.glob("rovgraph/*/falcon.yaml")  # it has been in other packages
+        return found
 
     def rovgraph(self, *arguments: object) -> Cost:
         """Run the command line."""

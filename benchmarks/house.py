@@ -24,12 +24,12 @@ from checkouts import ROOT, Checkout, Failed, checkout_of
 BASE = "07f9a06"
 # assembly, linearisation and what carries a ping, in either checkout; those that are missing have no lines
 CARRIES = (
-    "problem/admission.py", "problem/admission.py", "problem/assembly.py", "engine/dive_rows.py", "engine/keyframes.py",
+    "engine/admission.py", "engine/aiding.py", "engine/assembly.py", "engine/dive_rows.py", "engine/keyframes.py",
     "engine/landmarks.py", "engine/late_stamp_window.py", "engine/log_assembly.py", "engine/measurement_table.py",
-    "problem/measurements.py", "engine/motion.py", "engine/samples.py", "engine/sensor_rows.py",
-    "problem/admission.py", "engine/whole_log.py", "kernels/linearization.py",
+    "engine/measurements.py", "engine/motion.py", "engine/samples.py", "engine/sensor_rows.py",
+    "engine/time_offsets.py", "engine/whole_log.py", "kernels/linearization.py",
     # since 07f9a06
-    "problem/problem.py", "kernels/assembly.py",
+    "engine/problem.py", "kernels/assembly.py",
 )  # fmt: skip
 AMONG = ("engine", "kernels", "problem", "log")  # where a module that is new may carry a ping, too
 MOST = 7  # parameters

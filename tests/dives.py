@@ -22,7 +22,7 @@ from rovgraph.model.config import Config, beliefs, load_config
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
 
-FALCON = FilePath(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml"
+FALCON = FilePath(__file__).parents[1] / "rovgraph" / "model" / "falcon.yaml"
 LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))
 
 

@@ -235,7 +235,7 @@ def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
 
 def test_the_demonstration_dive_is_the_one_of_the_repository():
     made = (SHIPPED / "README.md").read_text(encoding="utf-8")
-    stated = f"simulate {SCENARIO} --seed {SEED} --outliers {CHOICES.outliers} --config rovgraph/config/falcon.yaml"
+    stated = f"simulate {SCENARIO} --seed {SEED} --outliers {CHOICES.outliers} --config rovgraph/model/falcon.yaml"
     assert stated in made
     assert rg.Choices(outliers=CHOICES.outliers) == CHOICES  # nothing else is chosen
 

@@ -28,7 +28,7 @@ from rovgraph.log import Log
 from rovgraph.report.figures_studies import draw_errors, draw_velocity
 
 ROOT = Path(__file__).parents[1]
-FALCON = ROOT / "rovgraph" / "config" / "falcon.yaml"
+FALCON = ROOT / "rovgraph" / "model" / "falcon.yaml"
 FEW = "graph-smoothed-misalignment,dead-reckoning,graph-smoothed-c"
 DIVES = ["--scenario", "circle", "--duration", "40", "--config", str(FALCON)]
 

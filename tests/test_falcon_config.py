@@ -1,4 +1,4 @@
-"""rovgraph/config/falcon.yaml says what the thesis says, and data/falcon is what its README says."""
+"""rovgraph/model/falcon.yaml says what the thesis says, and data/falcon is what its README says."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ MTI, DVL = np.diag(R_MTI), np.diag(R_DVL)
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load_config(ROOT / "rovgraph" / "config" / "falcon.yaml")
+    return load_config(ROOT / "rovgraph" / "model" / "falcon.yaml")
 
 
 def sensor_to_thesis_body(theta: np.ndarray) -> np.ndarray:

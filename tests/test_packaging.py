@@ -81,7 +81,7 @@ def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert names == {f"rovgraph/{name}" for name in files(ROOT / "rovgraph")}
-    assert {"rovgraph/py.typed", "rovgraph/config/falcon.yaml", "rovgraph/config/presets/dvls.yaml"} <= names
+    assert {"rovgraph/py.typed", "rovgraph/model/falcon.yaml", "rovgraph/model/presets/dvls.yaml"} <= names
     assert wheel.name.endswith("-py3-none-any.whl") and wheel.stat().st_size < 2e6
 
 

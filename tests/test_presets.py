@@ -117,7 +117,7 @@ def test_noise_of_one_grade_beside_a_bias_of_another_is_warned_of(text: str, sai
     assert (not texts) if said is None else any(t.startswith(f"c.yaml: {said}") for t in texts)
 
 
-@pytest.mark.parametrize("path", [*ROOT.glob("rovgraph/config/*.yaml"), *ROOT.glob("data/*/*.yaml")], ids=str)
+@pytest.mark.parametrize("path", [*ROOT.glob("rovgraph/model/*.yaml"), *ROOT.glob("data/*/*.yaml")], ids=str)
 def test_shipped_configurations_mix_no_grades(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)

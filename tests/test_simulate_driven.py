@@ -252,7 +252,7 @@ def test_waves_have_the_thesiss_frequency_and_a_consistent_acceleration():
 
 
 def test_falcon_travels_with_the_package():
-    assert falcon() == load_config(FilePath(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml")
+    assert falcon() == load_config(FilePath(__file__).parents[1] / "rovgraph" / "model" / "falcon.yaml")
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,7 @@ def naive_filter(setup: Setup, steps: int) -> tuple[Array, Array, Array]:
 
 
 def test_motion_is_the_same_as_in_the_thesis_own_axes_with_the_printed_numbers():
-    """Mountings, lever arms, noise and gravity of rovgraph/config/falcon.yaml are the thesis's, converted."""
+    """Mountings, lever arms, noise and gravity of rovgraph/model/falcon.yaml are the thesis's, converted."""
     case, begin, steps = lively_dive(), 10.0, 120
     log = case.log
     for sensor in log.streams:

@@ -11,8 +11,8 @@ from typing import Any
 from driver import run
 
 import rovgraph as rg
-from rovgraph.inference.fixed_lag import FixedLag
-from rovgraph.inference.initialise import initialise
+from rovgraph.estimators.eskf.fixed_lag import FixedLag
+from rovgraph.estimators.initialise import initialise
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator
