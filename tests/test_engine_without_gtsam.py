@@ -1,4 +1,4 @@
-"""Keyframes, motions and what filters take of them need no GTSAM."""
+"""Problems and their solvers need no GTSAM, but for `rovgraph.inference.graph`."""
 
 import subprocess
 import sys
@@ -10,10 +10,11 @@ import sys
 sys.modules["gtsam"] = None
 import importlib, pkgutil
 import numpy as np
-import rovgraph.engine, rovgraph.kernels
-for package in (rovgraph.engine, rovgraph.kernels):
+import rovgraph.inference, rovgraph.kernels, rovgraph.problem
+for package in (rovgraph.inference, rovgraph.kernels, rovgraph.problem):
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
-        importlib.import_module(module.name)
+        if module.name != "rovgraph.inference.graph":
+            importlib.import_module(module.name)
 from rovgraph.model.config import Config, beliefs
 from rovgraph.problem.assembly import Assembly
 from rovgraph.sensors.instruments import instruments

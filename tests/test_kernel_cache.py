@@ -107,7 +107,7 @@ def test_without_numba_one_line_says_what_to_install(command, tmp_path):
 
 @pytest.mark.slow
 def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else(tmp_path):
-    few = ["chain", "linear_chain"]
+    few = ["chain", "chain_posterior"]
     code = (
         "from rovgraph.kernels import compile as c; c.__dict__['_modules'] = lambda: " + repr(few) + "; "
         "c.os.sched_getaffinity = lambda pid: {0, 1}; c.cache_folder('rovgraph.kernels.chain')"
@@ -115,7 +115,7 @@ def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else
     done = run(code, ROVGRAPH_CACHE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     kept = sorted(folder.name.split("-")[1] for folder in tmp_path.iterdir())
-    assert kept == ["chain", "linear_chain"]
+    assert kept == ["chain", "chain_posterior"]
     assert all(any(folder.rglob("*.nbc")) for folder in tmp_path.iterdir())
 
 

@@ -127,7 +127,7 @@ def test_rows_wait_a_fifth_of_a_second_at_most_for_the_operating_system_and_a_se
 CRASHES = """
 import itertools, os, sys, time
 import numpy as np
-from rovgraph.live import recorder
+from rovgraph.live import files as recorder
 from rovgraph.live.message import Reading
 
 def write(file, data, write=os.write):

@@ -5,21 +5,12 @@ The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_C
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls a helper of a changed module is compiled again, which numba's own cache does not notice.
 
-How kernels are compiled beyond what numba promises (`rovgraph.kernels.compile`) is tried out on two small functions,
+How kernels are compiled beyond what numba promises (`rovgraph.kernels.compilers`) is tried out on two small functions,
 once for each version of numba. Where a numba does not take it, kernels are compiled as numba does by itself, which
 takes longer.
 
 Where several modules are missing, as many processes as there are cores compile them, each module after those that it
 imports. A process keeps the helpers that it has compiled for its next modules.
-
-What numba's compiler is asked for, of kernels and of the helpers that only they call.
-
-numba would optimise and assemble each helper by itself, and again within every caller, although nothing but kernels
-calls it. Here a helper stops at LLVM's unoptimised code and is linked into its kernels, which alone are optimised and
-assembled: that halves the time that all kernels take to compile.
-
-Wrappers are decided here and not by numba's options, because numba compiles a helper once more for each set of options
-that its callers have.
 """
 
 import contextlib
@@ -38,88 +29,11 @@ from pathlib import Path
 from typing import IO, Annotated, Any, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-from llvmlite.binding import parse_assembly, parse_bitcode
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 from numpy.typing import NDArray
 
 from rovgraph._version import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-
-
-class _NoEnvironment:
-    """In place of a code generator, for a function that has no address and hence no environment to set."""
-
-    def set_env(self, name: str, environment: object) -> None:
-        """Do nothing: the function has no environment."""
-
-
-class LinkedLibrary(JITCodeLibrary):
-    """A function's code, to be linked into that of another one and never called by itself."""
-
-    @property
-    def codegen(self) -> Any:
-        """Asked for to set the function's environment, and for nothing else."""
-        return _NoEnvironment()
-
-    def _optimize_final_module(self) -> None:
-        """The kernel that it is linked into is optimised."""
-
-    def _finalize_final_module(self) -> None:
-        """Ready to be linked, without machine code."""
-        cast(Any, self)._finalize_dynamic_globals()
-        self._finalized = True
-
-
-class KernelLibrary(JITCodeLibrary):
-    """Code of a kernel that no other calls but by its address: the cache keeps machine code of it, and its name.
-
-    numba would keep LLVM's code beside it, to be linked into others, and read it again whenever the kernel is loaded,
-    which takes longer than all else of loading it.
-    """
-
-    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
-        """As numba's, with the kernel and its wrappers in name only: it asks whether they are there."""
-        name, kind, (machine_code, code) = cast(Any, super()).serialize_using_object_code()
-        own = f"{len(name)}{name}B"  # as mangled
-        names = [f.name for f in parse_bitcode(code).functions if own in f.name and not f.is_declaration]
-        empty = "".join(f'define void @"{each}"() {{ ret void }}\n' for each in names)
-        return name, kind, (machine_code, parse_assembly(empty).as_bitcode() if names else code)
-
-
-class HelperCompiler(CompilerBase):
-    """numba's compiler with such a library, and without wrappers."""
-
-    def define_pipelines(self) -> list[Any]:
-        """As numba's."""
-        library: Any = LinkedLibrary  # numba's classes have no types
-        builder: Any = DefaultPassBuilder
-        self.state.flags.no_cpython_wrapper = self.state.flags.no_cfunc_wrapper = True
-        self.state.library = library(self.state.targetctx.codegen(), "helper")
-        return [builder.define_nopython_pipeline(self.state)]
-
-
-class KernelCompiler(Compiler):
-    """numba's compiler, with such a library for the kernels of this package."""
-
-    def define_pipelines(self) -> Any:
-        """As numba's."""
-        if self.state.func_id.modname.rpartition(".")[0] == __package__:
-            library: Any = KernelLibrary
-            self.state.library = library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-            self.state.library.enable_object_caching()
-        return cast(Any, super()).define_pipelines()
-
-
-class UncalledKernelCompiler(KernelCompiler):
-    """The same without a wrapper for C, which only a kernel that is called by its address needs."""
-
-    def define_pipelines(self) -> Any:
-        """As numba's."""
-        self.state.flags.no_cfunc_wrapper = True
-        return super().define_pipelines()
-
 
 try:
     import numba
@@ -261,6 +175,7 @@ def _compilation() -> _Compilation:
 
 
 def _special_compilation() -> _Compilation:
+    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
 
     helping = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
     kernel, called = ({**KERNEL, "pipeline_class": each} for each in (UncalledKernelCompiler, KernelCompiler))
