@@ -38,7 +38,7 @@ cli / api, extend / pages / report, export, web / studies, live / dive, intercha
 estimators, simulate, evaluate, calibrate / check / graph / engine /
 instruments, rules / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / tables / dates / gauss_markov, units, gps_time, stamps /
-geometry, workers, fast_csv, spilling / errors, process, progress.
+compatibility, geometry, workers, fast_csv, spilling / errors, process, progress.
 """
 
 import importlib

@@ -16,7 +16,7 @@ PACKAGE = ROOT / "rovgraph"
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
     {"errors", "process", "progress"},
-    {"geometry", "workers", "fast_csv", "spilling"},
+    {"compatibility", "geometry", "workers", "fast_csv", "spilling"},
     {"gauss_markov", "units", "gps_time", "stamps"},
     {"dates"},
     {"tables"},

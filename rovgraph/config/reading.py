@@ -3,7 +3,7 @@
 import io
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, Literal, TypeVar, get_origin
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from rovgraph import compatibility
 from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.grades import warn_of_mixed_grades
@@ -55,6 +56,7 @@ Model = TypeVar("Model", bound=BaseModel)
 class Config(Section):
     """What an estimator believes; see docs/configuration.md for all keys."""
 
+    version: Literal[1] = Field(1, description="of the keys and their meaning; a newer one is refused")
     name: str = Field("rovgraph", description="name, printed on figures")
     start: Start = Start()
     environment: Environment = Environment()
@@ -292,6 +294,7 @@ def merged(stated: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _parse_config(data: dict[str, Any], source: str) -> Config:
+    compatibility.refuse_newer(data.get("version"), compatibility.CONFIGURATION, f"{source}: configuration")
     config = parse_model(Config, data, source)
     warn_of_mixed_grades(config.imu, source)
     return config

@@ -16,10 +16,11 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from rovgraph import compatibility
 from rovgraph.errors import InputError
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.warnings import Warnings
-from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, all_columns
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, VERSION, all_columns
 
 FLUSH_S = 0.1  # from a row to the operating system
 SYNC_S = 1.0  # from there to the disk
@@ -31,7 +32,7 @@ THRUSTERS = tuple(f"thruster_{i}" for i in range(1, 9))
 
 def recorded_columns() -> tuple[str, ...]:
     """Columns of a recording."""
-    return (*all_columns(), *THRUSTERS, RECEIVED)
+    return (*all_columns(), *THRUSTERS, VERSION, RECEIVED)
 
 
 class Recorder:
@@ -81,7 +82,7 @@ class Recorder:
         readings : one per sensor, in SI
         """
         cells = [""] * self._width
-        cells[0], cells[-1] = repr(float(time)), f"{arrival:.6f}"
+        cells[0], cells[-2:] = repr(float(time)), (str(compatibility.LOG), f"{arrival:.6f}")
         for sensor, values in readings:
             places = self._places[sensor]
             if len(values) > len(places):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph import __version__
+from rovgraph import __version__, compatibility
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
@@ -54,7 +54,7 @@ class Source:
 
         Raises
         ------
-        InputError : no results folder of rovgraph
+        InputError : no results folder of rovgraph, or one of a newer version
         """
         if not folder.is_dir():
             what = "a file, not a folder" if folder.exists() else "no such folder"
@@ -69,6 +69,7 @@ class Source:
             raise InputError(f"{path}: cannot be read ({reason}); make the results again") from None
         if not isinstance(summary, dict) or summary.get("program") != STAMP["program"]:
             raise InputError(f"{path}: is not a summary of rovgraph; give a results folder of rovgraph")
+        compatibility.refuse_newer(summary.get("format"), compatibility.RESULTS, f"{folder}: results folder")
         return Source(folder, summary)
 
     @property

@@ -13,11 +13,15 @@ import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rovgraph import __version__
+from rovgraph import __version__, compatibility
 from rovgraph.errors import InputError, warn
 
 SUMMARY = "summary.json"
-STAMP = {"program": "rovgraph", "version": __version__}  # in every summary: the folder is ours
+STAMP = {  # in every summary: the folder is ours
+    "program": "rovgraph",
+    "version": __version__,
+    "format": compatibility.RESULTS,
+}
 
 
 def check_writable(path: Path, force: bool, inputs: Sequence[Path | None] = ()) -> None:
