@@ -80,13 +80,12 @@ def test_processes_that_compile_at_once_do_not_disturb_each_other(tmp_path):
 
 
 def test_the_folder_changes_with_the_version_and_with_what_a_kernel_imports(monkeypatch):
-    import rovgraph
     from rovgraph.kernels import compile as compiling
 
     before = compiling._state_of("rovgraph.kernels.correction")
     assert {"rotations", "compile", "compilers"} < compiling._imported_kernels("correction")
     compiling._state_of.cache_clear()
-    monkeypatch.setattr(rovgraph, "__version__", "another")
+    monkeypatch.setattr(compiling, "__version__", "another")
     assert compiling._state_of("rovgraph.kernels.correction") != before
     compiling._state_of.cache_clear()
 

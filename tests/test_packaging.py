@@ -22,6 +22,7 @@ import rovgraph
 ROOT = Path(__file__).parents[1]
 BUILT_FROM = (
     *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "Dockerfile", "mkdocs.yml"),
+    *("CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "constraints.txt", ".pre-commit-config.yaml", ".github"),
     *(".dockerignore", "rovgraph", "tests", "docs", "data", "configs", "benchmarks", "blueos", "examples"),
 )
 NOT_RELEASED = {".ci", ".gitignore"}

@@ -481,7 +481,9 @@ def test_held_by_the_step_of_a_released_constant(considered, limit, times, sever
     figure = times * (RULES["moved"].wrong if considered and limit == "wrong" else getattr(RULES["held"], limit))
     step = -figure * allowed
     hardly_seen = ScoreTest("dvl_roll", "dvl_roll", 99.0, 1.01 * constants.SHOWN * TABLE["dvl_roll"].sd)
-    monkeypatch.setattr(constants, "score_test", lambda *_: [ScoreTest("dvl_scale", "dvl_scale", step, sd), hardly_seen])
+    monkeypatch.setattr(
+        constants, "score_test", lambda *_: [ScoreTest("dvl_scale", "dvl_scale", step, sd), hardly_seen]
+    )
     belief = SimpleNamespace(mean=np.zeros(1), sd=prior_sd)
     unknowns = SimpleNamespace(considered=("dvl_scale",) if considered else ())
     best: Any = SimpleNamespace(state=track(), beliefs={"dvl_scale": belief}, unknowns=unknowns)

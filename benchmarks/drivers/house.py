@@ -9,10 +9,10 @@ from types import FrameType
 from typing import Any
 
 from driver import run
-
-import rovgraph as rg
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import initialise
+
+import rovgraph as rg
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator

@@ -27,6 +27,8 @@ ROOT = Path(__file__).parents[2]
 ELSEWHERE = {  # page or file of the site -> file of the project
     "index.md": "README.md",
     "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
     "licence.md": "LICENSE",
     "benchmarks.md": "benchmarks/README.md",
     "falcon.md": "data/falcon/README.md",

@@ -41,6 +41,7 @@ import pandas as pd
 import pymap3d
 from numpy.typing import NDArray
 
+from rovgraph import compatibility
 from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.inference.error_state import REINITIALISE_AT_S
@@ -52,7 +53,7 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Event
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, read_log
-from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, all_columns
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
 
 VERSION = 7
@@ -229,7 +230,7 @@ THRUSTERS = tuple(f"thruster_{i}" for i in range(1, 9))
 
 def recorded_columns() -> tuple[str, ...]:
     """Columns of a recording."""
-    return (*all_columns(), *THRUSTERS, RECEIVED)
+    return (*all_columns(), *THRUSTERS, VERSION_COLUMN, RECEIVED)
 
 
 class Recorder:
@@ -279,7 +280,7 @@ class Recorder:
         readings : one per sensor, in SI
         """
         cells = [""] * self._width
-        cells[0], cells[-1] = repr(float(time)), f"{arrival:.6f}"
+        cells[0], cells[-2:] = repr(float(time)), (str(compatibility.LOG), f"{arrival:.6f}")
         for sensor, values in readings:
             places = self._places[sensor]
             if len(values) > len(places):

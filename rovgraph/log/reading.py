@@ -10,6 +10,7 @@ import numpy as np
 import pymap3d
 from numpy.typing import NDArray
 
+from rovgraph import compatibility
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.latitudes import valid_positions
@@ -22,6 +23,7 @@ from rovgraph.log.streams import (
     SPACING_S,
     STREAMS,
     THRUSTER,
+    VERSION_COLUMN,
     Stream,
     all_columns,
     is_column,
@@ -113,12 +115,15 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
 
     Raises
     ------
-    InputError : a column or unit that is unknown, a cell that is no number, no time
+    InputError : a newer version; a column or unit that is unknown, a cell that is no number, no time
 
     Warns
     -----
     DataWarning : infinities; how the table was read, where it is not written as a log of this program
     """
+    if VERSION_COLUMN in table.names and len(table.frame):
+        stated = float(np.nanmax(table.numbers(VERSION_COLUMN), initial=1.0))
+        compatibility.refuse_newer(stated, compatibility.LOG, f"{table.source}: log")
     names = map_columns(table, settings.columns)
     scale = scales(settings.units, table.source)
     stated = _units_of_header({name: written for name, written in names.items() if name not in scale})

@@ -33,6 +33,7 @@ STREAMS: Mapping[str, tuple[str, ...]] = _Streams()  # sensor -> its columns
 LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
+VERSION_COLUMN = "rovgraph_log"  # version of the log's form; without this column it is 1
 DATE = "date"  # day, or GPS week, of the times beside it
 SPACING_S = 1e-4  # closer measurements of a sensor are of one time, and the first is taken: no sensor is that fast
 GAP_PERIODS = 5.0  # of a sensor, its usual ones: a longer silence is a gap

@@ -35,6 +35,7 @@ from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from rovgraph import compatibility
 from rovgraph.errors import InputError, as_path, kind_of, warn
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.model.calibration import AUTO, CONSIDERED, MOUNT, TABLE, Belief, Variable
@@ -257,6 +258,7 @@ Model = TypeVar("Model", bound=BaseModel)
 class Config(ConfigSection):
     """What an estimator believes; see docs/configuration.md for all keys."""
 
+    version: Literal[1] = Field(1, description="of the keys and their meaning; a newer one is refused")
     name: str = Field("rovgraph", description="name, printed on figures")
     start: StartSettings = StartSettings()
     environment: Environment = Environment()
@@ -494,6 +496,7 @@ def merged(stated: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _parse_config(data: dict[str, Any], source: str) -> Config:
+    compatibility.refuse_newer(data.get("version"), compatibility.CONFIGURATION, f"{source}: configuration")
     config = parse_model(Config, data, source)
     warn_of_mixed_grades(config.imu, source)
     return config

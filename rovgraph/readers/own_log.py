@@ -14,7 +14,7 @@ from rovgraph.geometry import Array
 from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
 from rovgraph.log.reading import in_order, numbers, read_columns
 from rovgraph.log.stamps import UNIX_S
-from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_COLUMN, is_column
 from rovgraph.log.tables import names_of, read_table
 from rovgraph.log.units import name_and_bracket
 from rovgraph.readers.formats import ReadingOptions
@@ -56,7 +56,7 @@ class OwnLog:
         clocks = {clock.name: clock}
         if RECEIVED in cells:
             clocks[IN_RECEIVED] = Clock(IN_RECEIVED, 0.0, 0.0, "Unix time of arrival")
-        ignored = [name for name in table.names if name not in names.values() and name != RECEIVED]
+        ignored = [name for name in table.names if name not in (*names.values(), RECEIVED, VERSION_COLUMN)]
         left = tuple(Left(name, int(table.frame[name].notna().sum()), "no column of a log") for name in ignored)
         tables = {} if beams is None else {BEAMS: {str(n): c.to_numpy(float) for n, c in beams_frame(beams).items()}}
         return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts), tables=tables)

@@ -17,11 +17,16 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from rovgraph import compatibility
 from rovgraph._version import __version__
 from rovgraph.errors import InputError, warn
 
 SUMMARY = "summary.json"
-STAMP = {"program": "rovgraph", "version": __version__}  # in every summary: the folder is ours
+STAMP = {  # in every summary: the folder is ours
+    "program": "rovgraph",
+    "version": __version__,
+    "format": compatibility.RESULTS,
+}
 
 
 def check_writable(path: Path, force: bool, inputs: Sequence[Path | None] = ()) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rovgraph import compatibility
 from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -212,7 +213,7 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
 
     Raises
     ------
-    InputError : no results folder, or not that estimate
+    InputError : no results folder, one of a newer version, or not that estimate
     """
     folder = Path(folder)
     try:
@@ -223,6 +224,7 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
         raise InputError(f"{folder}/summary.json: cannot be read ({str(error).splitlines()[0]})") from None
     if not isinstance(summary, dict) or summary.get("program") != "rovgraph":
         raise InputError(f"{folder}/summary.json: is not of rovgraph, expected a results folder of it")
+    compatibility.refuse_newer(summary.get("format"), compatibility.RESULTS, f"{folder}: results folder")
     there = [kind for kind in ESTIMATES if (folder / f"trajectory_{kind}.csv").is_file()]
     if not there or estimate not in (None, *there):
         found = ", ".join(there) or "no trajectory"

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from rovgraph import compatibility
 from rovgraph._version import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -62,7 +63,7 @@ class ResultsSource:
 
         Raises
         ------
-        InputError : no results folder of rovgraph
+        InputError : no results folder of rovgraph, or one of a newer version
         """
         if not folder.is_dir():
             what = "a file, not a folder" if folder.exists() else "no such folder"
@@ -77,6 +78,7 @@ class ResultsSource:
             raise InputError(f"{path}: cannot be read ({reason}); make the results again") from None
         if not isinstance(summary, dict) or summary.get("program") != STAMP["program"]:
             raise InputError(f"{path}: is not a summary of rovgraph; give a results folder of rovgraph")
+        compatibility.refuse_newer(summary.get("format"), compatibility.RESULTS, f"{folder}: results folder")
         return ResultsSource(folder, summary)
 
     @property
