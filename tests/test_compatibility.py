@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from rovgraph.live.checkpoint import VERSION, read_checkpoint, write_checkpoint
-from rovgraph.live.recorder import Recorder
 
 import rovgraph as rg
 from rovgraph.cli.app import main
 from rovgraph.compatibility import CONFIGURATION, LOG, RESULTS
+from rovgraph.live.files import VERSION, Recorder, read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
 from rovgraph.report.folder import STAMP, SUMMARY
 

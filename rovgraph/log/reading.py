@@ -122,8 +122,8 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
     DataWarning : infinities; how the table was read, where it is not written as a log of this program
     """
     if VERSION_COLUMN in table.names and len(table.frame):
-        stated = float(np.nanmax(table.numbers(VERSION_COLUMN), initial=1.0))
-        compatibility.refuse_newer(stated, compatibility.LOG, f"{table.source}: log")
+        version = float(np.nanmax(table.numbers(VERSION_COLUMN), initial=1.0))
+        compatibility.refuse_newer(version, compatibility.LOG, f"{table.source}: log")
     names = map_columns(table, settings.columns)
     scale = scales(settings.units, table.source)
     stated = _units_of_header({name: written for name, written in names.items() if name not in scale})
