@@ -25,7 +25,7 @@ from rovgraph.lab.estimators import ESTIMATORS, ChainTask, EstimatorSpec, outcom
 from rovgraph.lab.executors import in_workers, starting
 from rovgraph.lab.runs import Case, Recorded
 from rovgraph.log import Log
-from rovgraph.report.figures_studies import draw_errors, draw_velocity
+from rovgraph.report.figures_lab import draw_errors, draw_velocity
 
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "rovgraph" / "model" / "falcon.yaml"

@@ -27,11 +27,10 @@ from rovgraph.live.solution import Event, SensorHealth, Solution
 from rovgraph.web import broadcast
 from rovgraph.web import broadcast as broadcasting
 from rovgraph.web import view as tracking
-from rovgraph.web.app import BURST, LARGEST_BODY, application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts, read_charts
 from rovgraph.web.guard import LARGEST_HEADERS, Guard, parse_address, parse_origin, token_of
-from rovgraph.web.page import MOST_CONNECTIONS
+from rovgraph.web.page import BURST, LARGEST_BODY, MOST_CONNECTIONS, application
 from rovgraph.web.view import PIECE, LiveTrack, PageLimits, View
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & δύτης 潜水"
@@ -203,7 +202,7 @@ def test_what_is_not_there_is_not_found(server, number):
 
 
 def test_marks_are_limited(server, monkeypatch):
-    monkeypatch.setattr("rovgraph.web.app.MOST_MARKS", 2)
+    monkeypatch.setattr("rovgraph.web.page.MOST_MARKS", 2)
     server.show(solution())
     for _ in range(2):
         server.marks.drop("", solution())

@@ -41,7 +41,7 @@ from rovgraph.lab.thesis.processes import (
     Process,
     length,
 )
-from rovgraph.lab.thesis.recursion import Recursion, timetable
+from rovgraph.lab.thesis.run import Recursion, timetable
 from rovgraph.lab.thesis.setup import Setup, prepare
 from rovgraph.log import Log, Stream, read_log
 from rovgraph.model import thesis

@@ -72,9 +72,9 @@ def study_misalignment(
     InputError : an invalid study, a folder that exists or holds another study, a cluster that does not answer,
         a full disk (what was written before is kept)
     """
-    from rovgraph.report.figures_studies import draw_study
+    from rovgraph.report.figures_lab import draw_study
+    from rovgraph.report.lab import write_study
     from rovgraph.report.pages.reporting import write_page
-    from rovgraph.report.study import write_study
 
     plan = read_study(as_path(study, "study"))
     cells = chosen(plan, only)
@@ -125,9 +125,9 @@ class ComparisonResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
-        from rovgraph.report.comparison import write_comparison
-        from rovgraph.report.figures_studies import draw_comparison
+        from rovgraph.report.figures_lab import draw_comparison
         from rovgraph.report.folder import results_folder
+        from rovgraph.report.lab import write_comparison
         from rovgraph.report.pages.reporting import write_page
 
         with results_folder(as_path(path, "path"), force) as folder:
@@ -252,9 +252,9 @@ class ObservabilityResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
-        from rovgraph.report.figures_studies import draw_observability
+        from rovgraph.report.figures_lab import draw_observability
         from rovgraph.report.folder import results_folder
-        from rovgraph.report.observability import write_observability
+        from rovgraph.report.lab import write_observability
         from rovgraph.report.pages.reporting import write_page
 
         with results_folder(as_path(path, "path"), force) as folder:
@@ -285,9 +285,9 @@ class PlanResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
-        from rovgraph.report.figures_studies import draw_plan
+        from rovgraph.report.figures_lab import draw_plan
         from rovgraph.report.folder import results_folder
-        from rovgraph.report.observability import write_plan
+        from rovgraph.report.lab import write_plan
         from rovgraph.report.pages.reporting import write_page
 
         with results_folder(as_path(path, "path"), force) as folder:

@@ -196,8 +196,8 @@ def compare(
     from rovgraph.cli.console import console, progress_bar, say
     from rovgraph.lab.choices import listed
     from rovgraph.lab.estimators import select
-    from rovgraph.report.comparison import comparison_table
     from rovgraph.report.folder import check_writable
+    from rovgraph.report.lab import comparison_table
     from rovgraph.report.tables import fitting
 
     chosen = range(first_seed, first_seed + seeds)
@@ -239,7 +239,7 @@ def observe(
     import rovgraph as rg
     from rovgraph.cli.console import console, progress_bar, say
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.observability import observability_table, words
+    from rovgraph.report.lab import observability_table, words
 
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
@@ -285,7 +285,7 @@ def plan(
     from rovgraph.lab.choices import goals
     from rovgraph.lab.plan import SensorRates
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.observability import plan_table
+    from rovgraph.report.lab import plan_table
     from rovgraph.report.tables import fitting
 
     check_writable(out, force)
@@ -328,12 +328,12 @@ def misalignment(
     from rovgraph.cli.console import console, progress_bar, say
     from rovgraph.errors import InputError
     from rovgraph.lab.misalignment import read_study
-    from rovgraph.report.study import plan_table, study_table
+    from rovgraph.report.lab import study_plan_table, study_table
     from rovgraph.report.tables import fitting
 
     shown = console(STUDY_WIDTH)
     if show:
-        for part in fitting(plan_table(read_study(config)), shown):
+        for part in fitting(study_plan_table(read_study(config)), shown):
             shown.print(part)
         return
     if out is None:

@@ -10,7 +10,7 @@ import pandas as pd
 from rovgraph.lab.calibrate import MagnetometerCalibration, NoiseReport
 from rovgraph.lab.calibrate.piece import Piece, piece_yaml, with_piece
 from rovgraph.model.config import Config
-from rovgraph.report.figures_calibrate import draw_allan, draw_magnetometer, draw_spectra
+from rovgraph.report.figures_lab import draw_allan, draw_magnetometer, draw_spectra
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
 from rovgraph.report.style import save, style

@@ -6,7 +6,6 @@ docs/own-sensor.md shows how to `register` one of your own.
 
 from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, VEHICLE_TILT, CompassHeading, Tilt
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
-from rovgraph.sensors.inertial import IMU
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
 from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
 from rovgraph.sensors.position import DEPTH, FIX, SEEN_PLACE, PlaceOffset, Position
@@ -60,6 +59,20 @@ __all__ = [
     "settings",
     "unregister",
 ]
+
+IMU = Sensor(  # it carries the estimate from one measurement to the next
+    "imu",
+    (
+        *(Column(name, "acceleration", group="acc") for name in ("acc_x", "acc_y", "acc_z")),
+        *(Column(name, "rate", group="gyr") for name in ("gyr_x", "gyr_y", "gyr_z")),
+    ),
+    usual_rates=(5.0, 4000.0),
+    if_missing=(
+        "error",
+        "no IMU: the attitude between measurements is unknown; give acc_x, acc_y, acc_z, gyr_x, gyr_y, gyr_z, "
+        "or roll and pitch instead",
+    ),
+)
 
 _VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
 for _sensor in (IMU, MAG, AHRS, *_VEHICLE, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):

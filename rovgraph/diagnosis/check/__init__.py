@@ -17,10 +17,9 @@ import numpy as np
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
 from rovgraph.diagnosis.check.compasses import body_heading
-from rovgraph.diagnosis.check.current import current
 from rovgraph.diagnosis.check.dvl import dvl_and_imu
 from rovgraph.diagnosis.check.findings import Finding, Report, Timing, since
-from rovgraph.diagnosis.check.fixes import start, track
+from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
