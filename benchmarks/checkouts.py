@@ -47,6 +47,25 @@ class Cost:
     said: str
 
 
+def cost_of(command: list[str], environment: dict[str, str] | None = None) -> Cost:
+    """Run a command in a temporary folder.
+
+    Raises
+    ------
+    Failed : it ended with an error
+    """
+    with TemporaryDirectory() as folder, TemporaryFile() as said, TemporaryFile() as errors:
+        process = subprocess.Popen(command, stdout=said, stderr=errors, env=environment, cwd=folder)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        errors.seek(0)
+        if process.returncode:
+            last = errors.read().decode(errors="replace").strip().splitlines()[-1:]
+            raise Failed(f"exit code {process.returncode}: {''.join(last)}")
+        return Cost(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e6, said.read().decode())
+
+
 @dataclass(frozen=True)
 class Checkout:
     """A working copy.
@@ -88,16 +107,7 @@ class Checkout:
         command = [sys.executable, *map(str, arguments)]
         environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(self.root)}
         environment.pop("PYTHONDONTWRITEBYTECODE", None)  # users load from bytecode, too
-        with TemporaryDirectory() as folder, TemporaryFile() as said, TemporaryFile() as errors:
-            process = subprocess.Popen(command, stdout=said, stderr=errors, env=environment, cwd=folder)
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            said.seek(0)
-            errors.seek(0)
-            if process.returncode:
-                last = errors.read().decode(errors="replace").strip().splitlines()[-1:]
-                raise Failed(f"exit code {process.returncode}: {''.join(last)}")
-            return Cost(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e6, said.read().decode())
+        return cost_of(command, environment)
 
 
 @contextmanager

@@ -5,6 +5,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
@@ -62,6 +64,46 @@ def counted() -> Iterator[Counter[str]]:
         sys.setprofile(None)
 
 
+def plain(seconds: str) -> dict[str, int]:
+    """Modules that a plain `smooth` enters, its calls from one function of the package to another, and those of them
+    that cross a module's border.
+
+    All is imported and cached before. Comprehensions and generator expressions are no functions here.
+    """
+    made, config = simulated("lawnmower", 1, falcon(), Choices(duration=float(seconds)))
+    package = str(Path(rg.__file__).parent)
+    entered: set[str] = set()
+    calls: Counter[bool] = Counter()
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event != "call" or code.co_name.startswith("<") or not code.co_filename.startswith(package):
+            return
+        entered.add(code.co_filename)
+        caller = frame.f_back.f_code.co_filename if frame.f_back else ""
+        if caller.startswith(package):
+            calls[caller != code.co_filename] += 1
+        else:
+            calls[False] += 1
+
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "log.csv"
+        made.log_frame.to_csv(log, index=False)
+        for turn in ("first", "second"):
+            sys.setprofile(watch if turn == "second" else None)
+            try:
+                rg.smooth(rg.read_log(log, config), config).save(Path(folder) / turn, figures=False, page=False)
+            finally:
+                sys.setprofile(None)
+    return {"modules": len(entered), "calls": calls.total(), "crossing": calls[True]}
+
+
+def write(seconds: str, path: str) -> None:
+    """The log of a dive."""
+    made, _ = simulated("lawnmower", 1, falcon(), Choices(duration=float(seconds)))
+    made.log_frame.to_csv(path, index=False)
+
+
 def offline(seconds: str) -> Counts:
     """Instances that a whole `smooth` makes."""
     log, config, pings = dive(seconds)
@@ -116,5 +158,5 @@ def timed(seconds: str, times: str) -> list[float]:
 
 
 if __name__ == "__main__":
-    commands: dict[str, Callable[..., Any]] = {"offline": offline, "navigator": navigator, "live": live, "timed": timed}
-    run(commands)
+    commands: dict[str, Callable[..., Any]] = {"plain": plain, "write": write, "offline": offline}
+    run({**commands, "navigator": navigator, "live": live, "timed": timed})
