@@ -35,7 +35,8 @@ CARRIES = (
     "engine/measurements.py", "engine/motion.py", "engine/samples.py", "engine/sensor_rows.py",
     "engine/time_offsets.py", "engine/whole_log.py", "kernels/linearization.py",
     # since 07f9a06
-    "engine/problem.py", "kernels/assembly.py",
+    "kernels/assembly.py", "problem/admission.py", "problem/assembly.py", "problem/measurements.py",
+    "problem/problem.py",
 )  # fmt: skip
 AMONG = ("engine", "kernels", "problem", "log")  # where a module that is new may carry a ping, too
 MOST = 7  # parameters

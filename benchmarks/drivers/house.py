@@ -11,8 +11,6 @@ from types import FrameType
 from typing import Any
 
 from driver import run
-from rovgraph.estimators.eskf.fixed_lag import FixedLag
-from rovgraph.estimators.initialise import initialise
 
 import rovgraph as rg
 from rovgraph.live.clocks import Clocks
@@ -21,6 +19,13 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
+
+try:
+    from rovgraph.inference.fixed_lag import FixedLag
+    from rovgraph.inference.initialise import initialise
+except ImportError:  # until the packages were made anew
+    from rovgraph.estimators.eskf.fixed_lag import FixedLag
+    from rovgraph.estimators.initialise import initialise
 
 Counts = dict[str, Any]
 

@@ -19,7 +19,7 @@ from rovgraph.cli.online import online
 from rovgraph.cli.report import evaluate, export, report, tag
 from rovgraph.cli.smooth import smooth
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.process import limit_threads_and_gc
+from rovgraph.process import leave, limit_threads_and_gc
 
 app = typer.Typer(
     name="rovgraph",
@@ -58,8 +58,19 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object, *
         print(folded(f"warning: {message}", sys.stderr), file=sys.stderr)
 
 
+def run() -> NoReturn:
+    """Entry point of the console script ``rovgraph``: `main`, and out of the interpreter without taking it down."""
+    try:
+        main()
+    except SystemExit as stop:
+        if stop.code is not None and not isinstance(stop.code, int):
+            raise
+        leave(stop.code or 0)
+    leave(0)
+
+
 def main() -> None:
-    """Entry point of the console script ``rovgraph``."""
+    """Run the command that the arguments name."""
     limit_threads_and_gc()
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = _show_warning
