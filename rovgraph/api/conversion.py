@@ -30,24 +30,19 @@ from rovgraph.process import Progress, no_progress
 from rovgraph.readers.formats import (
     Format,
     ReadingOptions,
-    formats,
     head_of,
-    is_text,
     purpose,
     read_recording,
     recognise,
-    refusal,
 )
 from rovgraph.readers.guessing import guess_table
 from rovgraph.readers.guessing.groups import ColumnGuess
 from rovgraph.readers.guessing.quantities import POINTS_UP
 from rovgraph.readers.merging import ARRIVAL, EVERY, Merged, account, merge, notes
 from rovgraph.readers.own_log import FORMAT as OWN_LOG
-from rovgraph.readers.own_log import is_own_log
+from rovgraph.readers.own_log import NOTHING, Paths, is_plain_log, once
 from rovgraph.readers.recording import Recording, SourceMissing, earlier
 
-Paths = Path | str | Sequence[Path | str]
-NOTHING: Mapping[str, Any] = {}
 REPORT = ".report.json"
 
 
@@ -258,16 +253,6 @@ def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> 
             raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
 
 
-def once(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Files without those that are given again, and what to say of it."""
-    given: dict[Path, Path] = {}
-    said = []
-    for path in files:
-        if (same := given.setdefault(path.resolve(), path)) is not path:
-            said.append(f"{path}: is given twice{'' if path == same else f', as {same} too'}, and taken once")
-    return list(given.values()), said
-
-
 def _times(given: str | Mapping[str, str]) -> Mapping[str, str]:
     """Sensor or file, or `EVERY` -> whose times are taken.
 
@@ -294,25 +279,6 @@ def _read(path: Path, options: ReadingOptions, format_: Format | None, alone: bo
 
 def _describe_settings(merged: Merged, used: Mapping[str, Any]) -> list[str]:
     return [f"{key}: {value} ({merged.settings[key][1]})" for key, value in used.items()]
-
-
-def is_plain_log(path: Path, config: Config) -> bool:
-    """Whether a file is read as a log, not as a native file.
-
-    Raises
-    ------
-    InputError : it is neither: says what it is, and which command reads it
-    """
-    head = head_of(path)
-    if is_own_log(head, config.of_file(path).columns):
-        return True
-    if recognise(path) is not None:
-        return False
-    if what := purpose(path, head):
-        raise InputError(f"{path}: {what}")
-    if head and not is_text(head):
-        raise InputError(refusal(path, [each.title for each in formats()]))
-    return True
 
 
 def _format(path: Path, config: Config) -> Format | None:

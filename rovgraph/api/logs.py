@@ -7,7 +7,6 @@ from pathlib import Path
 import pandas as pd
 
 from rovgraph import log as library
-from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log, once
 from rovgraph.diagnosis.check import Finding, Report, bridge_jumps, examine
 from rovgraph.diagnosis.check import warn as warn_of_findings
 from rovgraph.errors import InputError, as_paths, kind_of, warn
@@ -15,6 +14,7 @@ from rovgraph.inference.initialise import refusal
 from rovgraph.log import Log
 from rovgraph.model.config import Config, completed, config_or_defaults
 from rovgraph.process import Progress, no_progress
+from rovgraph.readers.own_log import NOTHING, Paths, is_plain_log, once
 
 
 def read_log(
@@ -56,6 +56,8 @@ def read_log(
     alone = len(files) == 1 and not stated
     if alone and is_plain_log(files[0], config_or_defaults(config)):
         return library.read_log(files[0], config)
+    from rovgraph.api.conversion import convert  # and what joins recordings, which a single log does not need
+
     return convert(files, config, choose, shift, progress, times).log
 
 

@@ -59,7 +59,7 @@ def smooth(
 
     import rovgraph as rg
     from rovgraph.cli.console import progress_bar
-    from rovgraph.report.export import check_exportable, known_formats
+    from rovgraph.report.export.formats import check_exportable, known_formats
     from rovgraph.report.folder import check_writable
 
     out = Path("results-" + name_of(files)) if out is None else out

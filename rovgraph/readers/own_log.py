@@ -4,8 +4,9 @@ A log that is read alone does not come here: `rovgraph.log.read_log` reads it.
 """
 
 import warnings as python_warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,12 @@ from rovgraph.log.stamps import UNIX_S
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_COLUMN, is_column
 from rovgraph.log.tables import names_of, read_table
 from rovgraph.log.units import name_and_bracket
-from rovgraph.readers.formats import ReadingOptions
+from rovgraph.model.config import Config
+from rovgraph.readers.formats import ReadingOptions, formats, head_of, is_text, purpose, recognise, refusal
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 
+Paths = Path | str | Sequence[Path | str]  # of the files of one dive
+NOTHING: Mapping[str, Any] = {}
 SURE = 0.95
 IN_RECEIVED = "host that received"
 
@@ -107,3 +111,32 @@ def _clock(time: Array) -> Clock:
     known = time[np.isfinite(time)]
     unix = len(known) > 0 and UNIX_S[0] < np.median(known) < UNIX_S[1]
     return Clock("time", 0.0, 0.0, "stamps look like Unix time") if unix else Clock("time")
+
+
+def once(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Files without those that are given again, and what to say of it."""
+    given: dict[Path, Path] = {}
+    said = []
+    for path in files:
+        if (same := given.setdefault(path.resolve(), path)) is not path:
+            said.append(f"{path}: is given twice{'' if path == same else f', as {same} too'}, and taken once")
+    return list(given.values()), said
+
+
+def is_plain_log(path: Path, config: Config) -> bool:
+    """Whether a file is read as a log, not as a native file.
+
+    Raises
+    ------
+    InputError : it is neither: says what it is, and which command reads it
+    """
+    head = head_of(path)
+    if is_own_log(head, config.of_file(path).columns):
+        return True
+    if recognise(path) is not None:
+        return False
+    if what := purpose(path, head):
+        raise InputError(f"{path}: {what}")
+    if head and not is_text(head):
+        raise InputError(refusal(path, [each.title for each in formats()]))
+    return True

@@ -83,7 +83,7 @@ def known_formats(names: Sequence[str]) -> list[ExportFormat]:
     ------
     InputError : one that is not known, with the nearest
     """
-    known = export_formats()
+    known = export_formats() if names else {}
     for name in names:
         if name not in known:
             near = get_close_matches(name, known, 1, 0.0)[0]

@@ -10,7 +10,6 @@ from rovgraph.report.pages.calibration import calibration_section
 from rovgraph.report.pages.page import render, write
 from rovgraph.report.pages.sensors import clocks_section, compass_section, dvl_section, residuals_section
 from rovgraph.report.pages.source import PAGE, DiveSource, ResultsSource, about_section, damage_named, smooth_command
-from rovgraph.report.pages.studies import study_page_of
 from rovgraph.report.pages.track import cursor, origin, track_section
 from rovgraph.report.pages.uncertainty import separation_section, uncertainty_section
 from rovgraph.report.pages.verdict import verdict_section
@@ -52,6 +51,8 @@ def page_of(folder: Path) -> str:
     with damage_named(folder):
         if "main_estimate" in source.summary:
             return dive_page(DiveSource(source.folder, source.summary))
+        from rovgraph.report.pages.studies import study_page_of  # no dive needs these
+
         maker = study_page_of(source)
         if maker is None:
             raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth or a study")
