@@ -14,13 +14,11 @@ reflections of these rows, to
 
 (Golub and Van Loan 2013, 5.1 and 5.2; Bierman 1977, chapters IV and X), from which solution, covariances, draws
 and sensitivities follow backwards in time (`rovgraph.kernels.chain_posterior`). The information matrix is never
-formed: that squares the condition number, and a motion's rows tell positions to 1e-3 m where the prior may tell
-them to 1000 m.
+formed: that squares the condition number, and a motion's rows determine positions to 1e-3 m where the prior may be
+1000 m wide.
 
-A target is the place of a column that rows have beyond their own: below d a component of x_k, from d on a
-component of y. What a negative target stands for is ignored.
-
-Rows made triangular by Householder reflections (Golub and Van Loan 2013, 5.1 and 5.2).
+A target is the index of a column that rows have beyond their own: below d a component of x_k, from d on a
+component of y. Columns with a negative target are ignored.
 """
 
 import math

@@ -5,21 +5,16 @@ The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_C
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls a helper of a changed module is compiled again, which numba's own cache does not notice.
 
-How kernels are compiled beyond what numba promises (`rovgraph.kernels.compile`) is tried out on two small functions,
-once for each version of numba. Where a numba does not take it, kernels are compiled as numba does by itself, which
-takes longer.
+By default numba optimises and assembles each helper by itself, and again within every caller, although only kernels
+call it. Here a helper stops at LLVM's unoptimised code and is linked into its kernels, which alone are optimised and
+assembled: that halves the time that all kernels take to compile. Wrappers are chosen here and not by numba's options,
+because numba compiles a helper once more for each set of options that its callers have.
+
+numba does not promise that this works. So it is tried on two small functions, once for each version of numba. Where it
+fails, kernels are compiled as numba does by default, which takes longer.
 
 Where several modules are missing, as many processes as there are cores compile them, each module after those that it
 imports. A process keeps the helpers that it has compiled for its next modules.
-
-What numba's compiler is asked for, of kernels and of the helpers that only they call.
-
-numba would optimise and assemble each helper by itself, and again within every caller, although nothing but kernels
-calls it. Here a helper stops at LLVM's unoptimised code and is linked into its kernels, which alone are optimised and
-assembled: that halves the time that all kernels take to compile.
-
-Wrappers are decided here and not by numba's options, because numba compiles a helper once more for each set of options
-that its callers have.
 """
 
 import contextlib

@@ -20,9 +20,8 @@ so the covariance becomes F P F' + Q, and the derivative H of zeta by the bias o
 Between two samples both signals are taken as linear. The step above turns the specific force with the attitude at
 its beginning; rotating it by half the step's turn first makes the integration second order.
 
-What IMU samples around a keyframe say beyond their integral: rate, mean, gaps and noise.
-
-Samples are a table of shape (m, 7): time, specific force, rate, body axes.
+Beside the integral, IMU samples around a keyframe give its angular rate, their mean, gaps and noise. Samples are a
+table of shape (m, 7): time, specific force, rate, body axes.
 """
 
 import math
