@@ -1,11 +1,10 @@
 """Times as people write them, as seconds: dates, times of day, and the day numbers of other programs.
 
-pandas parses; what is decided here is the order of day and month, the zone, and the epoch of numbers. A date without a
-zone is in UTC unless `DateRules` state another zone. One that may mean two days is refused with both readings.
+pandas parses; this module decides the order of day and month, the zone, and the epoch of numbers. A date without a
+zone is in UTC unless `DateRules` state another zone. A date that may mean two days is refused with both readings.
 
-GPS time, weeks and seconds since 1980 without leap seconds, as Unix time, and back.
-
-Leap seconds are those of IERS Bulletin C; the last was that of 2017.
+GPS time, weeks and seconds since 1980 without leap seconds, is converted to Unix time and back. Leap seconds are those
+of IERS Bulletin C; the last was that of 2017.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""A whole dive: from a log and a configuration to its estimates."""
+"""A whole dive: from a log and a configuration to all its estimates and the verdict."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,7 @@
-"""What a package of your own imports to add a sensor, a format to read, or a format to write.
+"""For packages of your own: the names to import to add a sensor, a format to read, or a format to write.
 
-The names below stay as they are within a major version, as those of ``import rovgraph`` do; every other module is
-internal and may change with any release. docs/own-sensor.md, docs/formats.md and docs/export.md show their use.
+These names stay the same within a major version, as those of ``import rovgraph`` do; every other module is internal
+and may change with any release. docs/own-sensor.md, docs/formats.md and docs/export.md show their use.
 """
 
 from rovgraph.geometry import Array, rotate, skew

@@ -1,7 +1,4 @@
-"""What a process of rovgraph leaves undone: threads that wait for one another, and looking for garbage.
-
-How a long task tells how far it is.
-"""
+"""Process settings: one thread per library, fewer garbage collections; and the progress of a long task."""
 
 import contextlib
 import ctypes

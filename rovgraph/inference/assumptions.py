@@ -1,10 +1,10 @@
-"""What no measurement of a dive can show to be wrong, and what it rests on instead.
+"""Assumptions that this dive's data cannot test.
 
 A dive that is turned as a whole about the vertical, or shifted along it, obeys the same equations: a constant error of
-the heading shows against position fixes only, one of the depth only against a start at a known depth. So does nearly a
-dive whose velocities have another scale: the accelerations of a small vehicle hardly show it.
+the heading shows against position fixes only, one of the depth only against a start at a known depth. The same nearly
+holds for a dive whose velocities have another scale: the accelerations of a small vehicle hardly show it.
 
-Where the heading rests on one compass, of which no calibration is stated, its prior is wide (`Variable.unchecked_sd`).
+Where the heading rests on one compass without a stated calibration, its prior is wide (`Variable.unchecked_sd`).
 """
 
 from collections.abc import Collection

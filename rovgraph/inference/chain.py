@@ -1,10 +1,9 @@
 """The smoother of a dive that closes no loop: a chain of keyframes with a border of constants.
 
 Each iteration linearises all factors and eliminates them in the order of time, in one compiled pass
-(`rovgraph.kernels.elimination`). Calibration that walks is a part of each keyframe, what is constant is the border. The
-factors are those of the graph that `rovgraph.inference.graph` gives to GTSAM, and a test holds both optima equal.
-
-Where every variable of a chain stands: what walks in each keyframe's block, what is constant in the border.
+(`rovgraph.kernels.elimination`). Calibration that walks is a part of each keyframe's block, constants are the border:
+`ChainLayout` has the index of every variable. The factors are those of the graph that `rovgraph.inference.graph` gives
+to GTSAM, and a test holds both optima equal.
 """
 
 from collections import deque

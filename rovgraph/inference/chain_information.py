@@ -1,11 +1,9 @@
-"""What whitened rows say of a chain of keyframes and a border of constants: `rovgraph.kernels.chain` and
-`rovgraph.kernels.chain_posterior` for callers.
+"""Square-root information of a chain of keyframes with a border of constants: solution, covariances, sensitivities.
 
-Right-hand sides are minus the residuals where a Gauss-Newton step is wanted. Variables of the border whose error is
-considered, not estimated (Schmidt), come last in it: `SquareRoot.solve` and `SquareRoot.border_covariance` take how
-many they are, or what is believed of them.
-
-Whitened rows of a chain that are at hand, eliminated: for studies of the solver.
+This is the interface to `rovgraph.kernels.chain` and `rovgraph.kernels.chain_posterior`. Right-hand sides are minus the
+residuals where a Gauss-Newton step is wanted. Considered variables (Schmidt) come last in the border:
+`SquareRoot.solve` and `SquareRoot.border_covariance` take their number, or their covariance. `eliminate` takes whitened
+rows that are given, for studies of the solver.
 """
 
 from collections.abc import Callable, Sequence

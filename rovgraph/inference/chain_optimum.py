@@ -1,9 +1,8 @@
-"""The optimum of a dive that closes no loop, as `rovgraph.inference.optimum` asks of any solver.
+"""The optimum of a dive without closed loops, with the interface of `rovgraph.inference.optimum`.
 
-A part of a chain that is solved by itself, with what was known before it as its prior.
-
-The keyframes before the part are eliminated at the point where the chain stands; what they say of the part's first
-keyframe and of the border stays as rows. What comes after the part is left out.
+`window` makes a part of a chain that is solved by itself. The keyframes before the part are eliminated at the point
+where the chain stands; their information about the part's first keyframe and the border stays as rows, its prior. The
+keyframes after the part are left out.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

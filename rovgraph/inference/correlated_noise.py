@@ -1,38 +1,37 @@
-"""Errors that last, found in a dive by its likelihood.
+"""Correlated noise of sensors, found in a dive by its likelihood.
 
-The configuration's noise is white. Here a sensor gets an error that lasts, too, a first-order Gauss-Markov process of
-some sd and time constant, and the likelihood says whether the dive is better explained with it. With whitened rows of
+The configuration's noise is white. Here a sensor also gets an error that lasts, a first-order Gauss-Markov process of
+some sd and time constant, and the likelihood tells whether it explains the dive better. With whitened rows of
 priors, motions, walks and measurements, and the square root R of their information, it is
 
     -log L = cost + sum log |diag R| - sum log (weights of walks and priors)
 
-which counts what the error's freedom costs (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. It
-sees the error through all that the estimate has followed of it, where the autocovariance of residuals would not: fixes
-that are off for a minute take the track along. One elimination at the optimum, with an error as large as the noise,
-tells whether to look for more; that is all that a healthy dive costs. The most likely sd and time constant are those of
-the dive linearised at its optimum, and the dive is solved once with them. Where it gains other than promised, it is
-linearised there for another search: fixes that were rejected without the error come back with it.
+which counts the error's additional freedom (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. The
+likelihood also shows the part of the error that the estimate has followed, which the autocovariance of residuals does
+not: fixes that are off for a minute pull the track with them.
 
-A constant that is off makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where one makes
-the dive likelier, it is found instead, as an error of infinite time constant.
+One elimination at the optimum, with an error as large as the noise, tells whether to search; a healthy dive costs no
+more. The most likely sd and time constant are those of the dive linearised at its optimum, and the dive is solved once
+with them. Where the gain differs from the predicted one, the dive is linearised there for another search: fixes that
+were rejected without the error are admitted with it.
 
-Likelihood alone takes whatever bends most. So each error has a largest sd, by what such an instrument can do: a
-receiver of 1 m is not 5 m off for minutes, a bed easily moves by 0.3 m/s. Explanations that are clear, each by itself,
-are rivals: how much likelier one is measures noise, not whether the right one is among them. Where they put the track
-elsewhere, a dive does not say which is right.
-
-An error may also take another value at once: a compass when a tool is carried, a depth that is zeroed, a receiver that
-switches its datum, a DVL that locks onto a hull. Jumps of a sensor's residuals propose when, those that were rejected
-included, and the likelihood of the dive with these steps then compares with that of an error that wanders.
-
-How much likelier a dive is with constants of another sd, as it is linearised: of any of them by one elimination.
-
-With all of them in its border, what is left of the elimination is the information and the score of the border from all
-measurements. Priors are added to it, what is held is left out, and with S, s of the rest
+A wrong constant makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where a constant
+makes the dive likelier, it is found instead, as an error of infinite time constant. One elimination with all constants
+in the border gives the likelihood of other sds of any of them: it leaves the information and the score of the border
+from all measurements. Priors are added to it, held constants are left out, and with S, s of the rest
 
     -2 log L = sum of the priors' squares - s' S^-1 s + log |S| + sum of log of the priors' variances
 
-up to what is the same for all (`rovgraph.inference.correlated_noise`).
+up to a term that is the same for all.
+
+The likelihood alone prefers the most flexible error. So each error has a largest sd, by the instrument: a receiver of
+1 m is not 5 m off for minutes, a moving bed easily reaches 0.3 m/s. Explanations that are each clear are rivals: the
+difference of their likelihoods measures noise, not whether the right one is among them. Where rivals give different
+tracks, the dive does not determine which is right.
+
+An error may also step: a compass when a tool is carried, a depth that is zeroed, a receiver that switches its datum, a
+DVL that locks onto a hull. Jumps of a sensor's residuals, rejected ones included, propose the times, and the likelihood
+of the dive with these steps is compared with that of a Gauss-Markov error.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

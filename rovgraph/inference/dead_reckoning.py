@@ -1,9 +1,9 @@
 """Dead reckoning: gyro levelled by gravity and turned by a compass, DVL integrated.
 
-What a pilot has without an estimator, and the initial guess of one. The attitude is that of
-`rovgraph.kernels.dead_reckoning`, whose gains follow the believed noise. Calibration is held at its means, and every
-ping is believed that `graph` lets in, at its own time. Between pings velocity is linear in body axes; where there are
-none for longer it is that through the water, if that is measured, and the current of the pings around.
+A pilot without an estimator has this, and it is the smoother's initial guess. The attitude is that of
+`rovgraph.kernels.dead_reckoning`, whose gains follow the configured noise. Calibration is held at its means, and every
+ping that `graph` admits is used, at its own time. Between pings velocity is linear in body axes; in a longer gap it is
+the velocity through the water, if that is measured, plus the current of the pings around.
 """
 
 import math

@@ -1,12 +1,9 @@
-"""Error-state Kalman filter driven by the IMU, over a whole dive, and its smoother.
+"""The error-state Kalman filter over a whole dive, its history, and its smoother.
 
-`rovgraph.inference.filter` is the filter; here its steps are kept. Only the newest keyframe is corrected as
-measurements come. The smoother goes back over the filter's steps (Rauch, Tung and Striebel 1965) without linearising
-again.
-
-What a filter has found on its way through a dive, and the estimate that comes of it.
-
-A filter's newest keyframe as the smoother has it, from the whole of the dive so far.
+`ErrorStateFilter` runs `rovgraph.inference.filter` over a dive and keeps the steps as a `FilterHistory`, from which the
+estimate is made. Only the newest keyframe is corrected as measurements come. The smoother goes back over the filter's
+steps (Rauch, Tung and Striebel 1965) without linearising again. `reinitialised` puts the smoother's newest keyframe of
+the dive so far in place of the filter's.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,4 @@
-"""What an estimator returns.
-
-From states and covariances at the IMU to an `Estimate` of the body's origin.
-"""
+"""The result of an estimator: `Estimate`, made from states and covariances at the IMU, for the body's origin."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

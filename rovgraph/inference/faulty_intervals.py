@@ -1,24 +1,25 @@
-"""Stretches in which a sensor is wrong all the time, found by the cost of leaving them out.
+"""Intervals in which a sensor is wrong all the time, found by the cost of leaving them out.
 
 Gates look at one measurement at a time. A DVL that is biased for half a minute moves the estimate with it, and its good
-pings before and after are rejected instead: an optimum of its own, from which no gate leads away. Rejections in a burst
-give it away. Then the measurements around the burst are taken out, one sensor's at a time, the dive is solved without
-them, and the stretch is fitted to what makes the dive cheapest.
+pings before and after are rejected instead: another local optimum, which gates do not leave. A burst of rejections
+reveals it. Then the measurements around the burst are excluded, one sensor's at a time, the dive is solved without
+them, and the interval is fitted to give the least cost.
 
-A stretch must not cost as many single outliers do, since it has one cause. It costs what as many good measurements
-cost, at the most that chance allows:
+An interval must cost less than as many single outliers, since it has one cause. It costs as much as the same number of
+good measurements may cost by chance:
 
     J = cost of what is let in + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
 
-with n a sensor's measurements in its stretches, Q the quantile of chi-square beyond which one in a million lies, and s
-the mean square of normalised residuals of what is let in, at least 1. So a stretch is taken out only where its
-measurements cost more than good ones ever do, by the standard of the rest of the dive. A sensor that is wrong most of
-the time, or a dive that is no better without it, is not as configured: alarms say so, and nothing is taken out.
+with n a sensor's measurements in its intervals, Q the quantile of chi-square beyond which one in a million lies, and s
+the mean square of normalised residuals of admitted measurements, at least 1. So an interval is excluded only where its
+measurements cost more than good ones ever do, by the standard of the rest of the dive. Where a sensor is wrong most of
+the time, or the dive is no better without the interval, all measurements stay and alarms report it.
 
-The search frees what the dive holds and does not know exactly, such as the mounting of the DVL: a tilt that is held at
-zero makes all pings cost more than they should, so that leaving out more of them would always pay.
+The search frees constants that the dive holds and that are not exact, such as the mounting of the DVL: a tilt that is
+held at zero makes all pings cost more than they should, so that excluding more of them would always pay.
 
-It solves a dive some dozens of times. Of a long dive it solves the part around the burst, with what was known before.
+It solves a dive some dozens of times. Of a long dive it solves the part around the burst, with the information before
+it as prior.
 """
 
 import math

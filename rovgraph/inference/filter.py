@@ -1,24 +1,18 @@
-"""The error-state Kalman filter: `FilterEngine.step` takes one interval, and is the only loop body there is.
+"""The error-state Kalman filter: `FilterEngine.step` takes one interval, offline and live.
 
-The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated. What
-is considered moves nothing; its part of the error goes along with the estimate (`Gaussian.B`).
-Motion, measurement equations, noise, losses, gates and prior are the smoother's own. What differs: every measurement
-is linearised once, where it comes.
+The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated
+(`ErrorLayout`). Considered variables receive no correction; their part of the error is carried with the estimate
+(`Gaussian.B`), and in Jacobians their columns follow those of the error. Motion, measurement equations, noise, losses,
+gates and prior are those of the smoother, with one difference: every measurement is linearised once, when it arrives.
 
-Per interval, the measurements between two keyframes correct the earlier one, as they do in the smoother; the state
-goes on to the next keyframe with the IMU; what was measured there corrects it.
+Per interval, the measurements between two keyframes correct the earlier one, as they do in the smoother; the IMU
+carries the state to the next keyframe; the measurements there correct it.
 
-Where to linearise an attitude that is hardly known, as after a silence of all sensors.
-
-A heading that may be off by half a right angle cannot be corrected along a tangent: a magnetic field
-that turns by forty degrees there grows by a fifth, which the filter would take for hard iron and
-tilt. So gravity and the compasses are looked at first, and the estimate is turned to where they fit.
-That is no measurement: the covariance stays, and they enter afterwards as they always do. It is what the
-iterated Kalman filter does (Bell and Cathey 1993), for the attitude alone, and begun where it can converge.
-
-Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated.
-
-In Jacobians, what is considered has columns behind those of the error.
+A poorly known attitude, as after a silence of all sensors, is first turned to where gravity and the compasses fit. A
+heading that may be off by half a right angle cannot be corrected along a tangent: a magnetic field that turns by forty
+degrees there grows by a fifth, which the filter would take for hard iron and tilt. The turn is not a measurement: the
+covariance stays, and gravity and compasses correct the filter afterwards as usual. It is an iterated Kalman filter
+(Bell and Cathey 1993), for the attitude alone, started where it can converge.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What goes into an interval of the error-state filter, and what comes out."""
+"""Inputs and results of one interval of the error-state filter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

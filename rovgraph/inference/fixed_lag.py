@@ -1,9 +1,8 @@
 """The error-state filter on data that arrive late and in any order, for missions without end.
 
-Measurements are held back for a moment, put in order, and then taken. One that comes later
-still is put where it belongs: the filter goes back to the keyframe before it and takes
-everything since once more. So the estimate does not depend on the order of arrival, as
-long as nothing is later than the lag; and nothing older than that is kept.
+Measurements are held back for a moment, put in order, and then processed. One that arrives later still is put where it
+belongs: the filter goes back to the keyframe before it and processes everything since again. So the estimate does not
+depend on the order of arrival, as long as no measurement is later than the lag; older data are dropped.
 """
 
 from collections import deque

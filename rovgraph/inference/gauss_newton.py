@@ -3,15 +3,15 @@
 A Gauss-Newton step of a reweighted problem is a direction of descent of the robust cost. It is halved until the cost
 falls, so the iteration cannot diverge. Where the cost falls by more than the linear problem promises it is doubled as
 long as that helps: reweighted steps fall short where many measurements lie beyond their loss's bend. When it has
-converged, measurements beyond their gate are taken out, those back within it let in, and it is solved again until the
-gates rest. A measurement that is out costs what one at its gate costs: the robust cost is a truncated loss, of which
-optima with different gates compare.
+converged, measurements beyond their gate are excluded, those back within it admitted, and it is solved again until the
+gates stay the same. An excluded measurement costs as much as one at its gate: the robust cost is a truncated loss, by
+which optima with different gates compare.
 
-It has converged when the decrease that is left is small. A whole step that takes g off the cost where the linear
-problem promised p has bent the cost by b = g / p - 1 of what was promised: by weights that change, or by what is not
+It has converged when the remaining decrease is small. A whole step that lowers the cost by g, where the linear problem
+predicted p, differs from the prediction by b = g / p - 1 of it: because weights change, or because the problem is not
 linear. Along a parabola of another curvature, steps leave p b^2 / (1 - b). Steps that converge by a factor leave a
-geometric series of decreases, so two of them say what is left, too. A decrease of e is a move of sqrt(2 e) sd in the
-direction in which the data know least about it.
+geometric series of decreases, so two of them also give the rest. A decrease of e is a move of sqrt(2 e) sd in the
+direction that the data determine least.
 """
 
 import math

@@ -1,19 +1,13 @@
-"""Where a dive begins, and what the configuration leaves to the log.
+"""Initial conditions of a dive from its first seconds: attitude, heading, position, biases.
 
-Attitude comes from gravity (specific force averaged in the axes of the first sample)
-and heading from whatever the log has; the gyro's bias from standing still, where it
-stands still. An explicit ``start`` goes before all of it.
+Attitude comes from gravity (specific force averaged in the axes of the first sample), heading from the log's heading
+sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. An
+explicit ``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often
+wrong as any other, and here no gate would find it.
 
-What heading sources say of an attitude: by which angle about down it is to be turned.
-
-All of it through the instruments' own models, so it serves every source alike.
-
-What the first seconds of a log say: how it is levelled, whether it stands still, its heading, where it is.
-
-Nothing rests on a single sample: the first of a sensor is as often wrong as any other, and here
-no gate would find out.
-
-Whether a dive is reckoned without an IMU, and where it then begins.
+Each heading source gives the angle about down by which an attitude must be turned, through the instrument's own model,
+so one function serves all sources. `with_motion_model` decides whether a dive is estimated without an IMU, and where
+it then begins.
 """
 
 from collections.abc import Collection, Mapping

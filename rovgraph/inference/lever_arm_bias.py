@@ -5,10 +5,10 @@ derivative by the arm has e in it, and so has the innovation, as e x l. Least sq
 
     F = sum over pings of rate_sd^2 (tr(M) 1 - M),   M = R_bs (diag(sd^2) + G G' rate_sd^2)^-1 R_bs'
 
-as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the score - F l. Without both, what is left
-is what the vehicle's own rates show: the corrected score (Nakamura 1990). Of a vehicle that hardly rolls, with an IMU
-for autopilots, nothing is left of the arm's z, however long the dive is. Noise that the estimate follows is in no
-innovation, so M is taken less by the part of a ping's information that goes into its own prediction.
+as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the score - F l. Without both, the
+information of the vehicle's own rates remains: the corrected score (Nakamura 1990). For a vehicle that hardly rolls,
+with an IMU for autopilots, no information about the arm's z remains, however long the dive is. Noise that the estimate
+follows is not in the innovation, so M is reduced by the part of a ping's information that goes into its own prediction.
 """
 
 from dataclasses import dataclass

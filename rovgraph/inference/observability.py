@@ -1,15 +1,14 @@
-"""What a dive says of the calibration: information, and a verdict on every component.
+"""Observability of the calibration: the information that a dive adds, and a verdict on every component.
 
 Everything is in units of the prior's sd: with D the information that the data add, the
 covariance of the calibration is (1 + D)^-1 and an sd of 1 is the prior repeated.
 
-A graph is linearised where its noisy estimate lies. A velocity that is constant in truth
-trembles in the estimate, the graph takes the trembling for accelerations, and these seem to
-show the DVL's misalignment and scale: along a straight line it claims to know what cannot be
-known. What noise adds is found by adding as much again (simulation extrapolation; Cook and
-Stefanski 1994): noise of the states is drawn from the graph's own posterior, put onto the
-estimate with both signs, and what the information gains by that is taken off once. Noise of the gyro in the DVL's lever
-arm is taken off by its equation (`rovgraph.inference.lever_arm_bias`).
+A graph is linearised at its noisy estimate. A velocity that is constant in truth trembles in the estimate, the
+linearisation takes the trembling for accelerations, and these seem to show the DVL's misalignment and scale: spurious
+information, even along a straight line. It is found by adding the same noise again (simulation extrapolation; Cook and
+Stefanski 1994): noise of the states is drawn from the graph's own posterior, added to the estimate with both signs, and
+the information gained by that is subtracted once. The effect of the gyro's noise through the DVL's lever arm is
+subtracted by its equation (`rovgraph.inference.lever_arm_bias`).
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The optimum of a dive, whichever solver found it, and how certain it is."""
+"""The optimum of a dive and its covariances, whichever solver found it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """Batch smoothing of a whole dive.
 
-The optimum of a dive: a chain where no place is seen twice, and GTSAM's graph where loops are closed.
+`optimum` solves a chain where no place is seen twice, and GTSAM's graph where loops are closed.
 """
 
 from collections.abc import Collection, Mapping, Sequence

@@ -1,6 +1,6 @@
-"""Chains with more unknowns than a dive's: constants that its estimate holds, or errors that last.
+"""Chains with additional unknowns: constants that the estimate holds, or errors that last.
 
-What held constants would do to the estimate follows from one elimination where it stands, without another solution:
+The effect of held constants on the estimate follows from one elimination at the optimum, without another solution:
 their derivatives are those of the measurement equations, of the IMU's mean signals for its scales, and of the
 predictions by time for stamps.
 """

@@ -1,4 +1,4 @@
-"""What each beam of a DVL measured: a table beside a log. Reports show it; no estimate uses it.
+"""Single beams of a DVL: a table beside a log, which reports show and no estimate uses.
 
 The table has ``time`` [s] and, for every beam by the instrument's own number k, ``valid_k`` (1 or 0), ``velocity_k``
 [m/s], ``range_k`` or ``distance_k`` [m]. One of these is enough; other columns are ignored.

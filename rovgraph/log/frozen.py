@@ -1,13 +1,13 @@
-"""Measurements that are none: a sensor repeats or halves them, or writes zeros, although the vehicle moves.
+"""Invalid measurements: a sensor repeats or halves its values, or writes zeros, although the vehicle moves.
 
 Some instruments write zeros when they lose the bottom, others their last value when they hang, others the mean of a
-ping and nothing. A sensor that measures shows its noise, so a value that returns exactly for seconds is none, unless
-the sensor usually holds its values for so long. Where resolution may hide the noise (depth, heading), another sensor
-has to show the motion.
+ping and zero. Real measurements are noisy, so a value that repeats exactly for seconds is invalid, unless the sensor
+usually holds its values for so long. Where resolution may hide the noise (depth, heading), another sensor has to show
+the motion.
 
-Single ones are known by the company they keep (`false_values`): an exact zero is none where the measurements next to it
-are further from zero than the vehicle can come and go meanwhile, so zeros of a vehicle at rest stay. That needs neither
-another sensor nor its clock.
+Single values are judged by their neighbours (`false_values`): an exact zero is invalid where the measurements next to
+it are further from zero than the vehicle can come and go meanwhile, so zeros of a vehicle at rest stay. That needs
+neither another sensor nor its clock.
 """
 
 import sys

@@ -1,8 +1,8 @@
-"""Latitudes and longitudes that are none, or are written otherwise than in degrees, told apart by their numbers.
+"""Latitudes and longitudes that are invalid, or not in degrees, recognised by their numbers.
 
-A receiver without a fix writes a number that no position has. Degrees and minutes in one number (4330.5 = 43 deg 30.5
-min), 1e-7 degrees, and exchanged columns are beyond the range of degrees in every row, and within it once put right.
-What stays within the range (radians, exchanged columns near the equator) shows against the DVL
+A receiver without a fix writes an impossible position. Degrees and minutes in one number (4330.5 = 43 deg 30.5
+min), 1e-7 degrees, and exchanged columns are beyond the range of degrees in every row, and within it once corrected.
+Errors within the range (radians, exchanged columns near the equator) show against the DVL
 (`diagnosis.check.fixes`).
 """
 

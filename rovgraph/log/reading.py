@@ -1,6 +1,6 @@
 """From a file to streams: names, units, the order of time, one stream per sensor.
 
-What can be repaired is repaired and said in a `DataWarning`; what cannot is an `InputError`.
+A repaired fault is reported in a `DataWarning`; a fault that cannot be repaired is an `InputError`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

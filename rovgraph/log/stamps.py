@@ -1,8 +1,8 @@
-"""Stamps of clocks that misbehave: what every reader and every live source does about them.
+"""Corrects the stamps of faulty clocks, for every reader and every live source.
 
-Stamps are taken in the order in which they were recorded. Those of a clock that was not set are left out; a counter
-that wraps goes on; a clock that is set by hours, leap seconds, days or 1024 weeks is put right; what stands still, or
-was written with too few digits, is called that.
+Stamps are taken in the order in which they were recorded. Stamps of a clock that was not set are left out; a counter
+that wraps is continued; a clock that is set by hours, leap seconds, days or 1024 weeks is corrected; stamps that stand
+still, or were written with too few digits, are reported.
 """
 
 from collections.abc import Iterator

@@ -1,8 +1,8 @@
 """A file as columns of cells: CSV as anyone writes it, gzipped or not, or Parquet, told apart by content.
 
 Encoding, separator, decimal commas and a row of units are found in the first bytes, and pandas parses. A file that is
-not written as this program's own is read with a warning that says how. What is wrong with a file is said in one line:
-which file, which line and column, what was expected and what to do.
+not written as this program's own is read with a warning that states how. An error is one line: which file, which line
+and column, what was expected and what to do.
 """
 
 import csv

@@ -1,25 +1,17 @@
-"""`Config`, and how it is read, written and described.
+"""The configuration: `Config`, and how it is read, completed, checked, written and described.
 
-Noise and bias of an inertial unit that cannot be of one instrument.
+A configuration is YAML; every key is optional, an unknown key is an error. `Config` holds what an estimator assumes
+about the vehicle, its sensors and the sea. `load_config` reads a file, `Config.to_yaml` writes the effective one,
+`describe` lists all keys, `beliefs` gives the calibration variables of `rovgraph.model.calibration` their priors.
+Native files complete a configuration only where it states no value itself.
 
-A sensor of density d, averaged at rest for a time T, shows its bias to d / sqrt(T). A prior that is sharper than ten
-minutes of that is knowledge that hardly anyone has. A prior that is far wider is of a worse instrument: of the
-instruments whose data sheets state both (`rovgraph.model.presets`) the widest offset is 250 sqrt(Hz) d.
+Sections that depend on registered sensors and variables get their keys when their class is made; `add_key` and
+`remove_key` change them afterwards, and the sections that contain them.
 
-Calibration variables in the configuration, and the priors that come of them.
-
-Sections of the configuration that grow with what is registered.
-
-A section gets its keys when its class is made; `add_key` and `remove_key` change them afterwards, and those of all
-that has the section inside.
-
-A configuration completed by what files know: only where it states nothing itself.
-
-The configuration: YAML, every key optional, an unknown key is an error.
-
-`Config` holds what an estimator believes about the vehicle, its sensors and the sea.
-`load_config` reads a file, `Config.to_yaml` writes the effective one, `describe` lists
-all keys, `beliefs` gives the calibration variables of `rovgraph.model.calibration` their priors.
+Noise and bias of an inertial unit are checked against each other. A sensor of density d, averaged at rest for a time T,
+shows its bias to d / sqrt(T). A prior sharper than ten minutes of that is hardly ever justified. A prior that is far
+wider belongs to a worse instrument: of the instruments whose data sheets state both (`rovgraph.model.presets`) the
+widest offset is 250 sqrt(Hz) d.
 """
 
 import io

@@ -1,18 +1,14 @@
-"""Which measurements may reach an estimate.
+"""From readings to admitted measurements: which may enter an estimate, at what time, and as which arrays.
 
-Thruster signals and IMU samples become measurements of `ModelAiding`.
+`admitted` applies the limits of each sensor. `thruster_pieces` makes measurements of `ModelAiding` from thruster
+signals and IMU samples; the pieces are short, since the mean over a second of turning and rocking differs from the
+value in its middle, so a long interval between keyframes holds several. `pack` and `unpack` turn measurements into a
+few arrays, for files and between processes.
 
-Pieces are short, since a mean over a second of turning and rocking is not what is so in its
-middle; between keyframes that are further apart there are several.
-
-Measurements as a few arrays, for files and between processes.
-
-How late stamps may be, and where on the time line a measurement is put for that.
-
-A measurement stands at its stamp less the time offset that is assumed. What remains until the one that is estimated is
-bridged by a window, the motion at knots around the stamp (`rovgraph.kernels.linearization`). So the assumption need not
-be right, but the nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The assumption
-may be renewed while measurements come.
+`TimeOffsets` holds how late stamps may be. A measurement is placed at its stamp less the assumed time offset; a window,
+the motion at knots around the stamp (`rovgraph.kernels.linearization`), bridges the rest. So the assumption may be
+wrong, but the nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. It may be renewed
+while measurements arrive.
 """
 
 from collections import Counter

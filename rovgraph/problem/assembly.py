@@ -1,9 +1,9 @@
-"""What has come of a dive, and the keyframes that are made of it, as arrays that grow.
+"""Assembly of a dive: all that has arrived, and the keyframes made of it, as arrays that grow.
 
 `Assembly.extend` is the only rule of assembly, compiled in `rovgraph.kernels.assembly`: called once for a log, and for
-each ping online. Every keyframe knows how much had come when it was made, so that a measurement that comes late is
-inserted and the keyframes since are made once more. Time offsets that are estimated are assumed anew for what is read
-from then on. What noise has been learnt, and how often places have been seen, stands with the keyframes.
+each ping online. Each keyframe stores how much had arrived when it was made, so that a late measurement is inserted and
+the keyframes since are made again. A renewed assumption of an estimated time offset holds for measurements that arrive
+from then on. Learnt noise, and the number of sightings of places, are stored with the keyframes.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What of the calibration is estimated, and what is considered."""
+"""Roles of the calibration variables: which are estimated, and which are considered."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

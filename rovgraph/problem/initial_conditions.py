@@ -1,4 +1,4 @@
-"""What is believed where a dive begins."""
+"""Initial conditions: the estimate and covariance where a dive begins."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -1,14 +1,14 @@
-"""What sensors have measured of a dive, linearised about states of its keyframes.
+"""Measurements of a dive, linearised about states of its keyframes.
 
 The equations are compiled (`rovgraph.kernels.linearization`): the state at a measurement's own time, the prediction
-there, whitening. A model that no kernel knows is given the states at its measurements' times, all at once, and gives
+there, whitening. A model without a kernel takes the states at all its measurements' times at once, and returns
 predictions and Jacobians there.
 
 Robust losses are applied by reweighting: the weight of a measurement is
 rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero where it is
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 
-Pieces of a long dive, so that what is large of a measurement is there for some of them at a time.
+A long dive is linearised in pieces, so that the Jacobians of a piece only are in memory.
 """
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence

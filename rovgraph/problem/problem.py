@@ -1,6 +1,6 @@
 """A dive as arrays: n keyframes, the motions between them, and what was measured at them and after them.
 
-Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter, and whoever looks at what they have found.
+Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter. So do statistics and alarms.
 """
 
 from collections.abc import Mapping, Sequence

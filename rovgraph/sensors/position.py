@@ -1,7 +1,4 @@
-"""Sensors of position: depth, and fixes.
-
-Places that a camera or a sonar recognises.
-"""
+"""Sensors of position: depth, fixes, and places that a camera or a sonar recognises."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

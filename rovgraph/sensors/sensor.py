@@ -1,7 +1,7 @@
-"""A sensor in one place: its stream, model, noise, admission, what it observes, and what can be wrong with it.
+"""A sensor in one place: its stream, model, noise, admission, what it observes, and its checks.
 
-`Sensor` carries all that rovgraph knows of one; `SENSORS` holds every sensor by the name of its log stream. Log
-reader, assembly, estimators, simulator, checks and the online mode read it.
+A `Sensor` holds everything about one sensor; `SENSORS` has every sensor by the name of its log stream. Log reader,
+assembly, estimators, simulator, checks and the online mode read it.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""What a person may choose of a simulated dive beside its scenario and seed."""
+"""Options of a simulated dive beside its scenario and seed."""
 
 from dataclasses import dataclass, fields
 from math import hypot, isfinite

@@ -3,9 +3,8 @@
 Each sensor is sampled at its own epochs by ``model.predict`` with the true state and the
 true calibration; noise and faults come on top. All randomness comes from one generator.
 
-The inertial unit: specific force and angular rate at its own place, in its own axes.
-
-At the lever arm l, with the Earth's rate w_ie where it is modelled,
+The inertial unit measures specific force and angular rate at its lever arm l, in its own axes. With the Earth's rate
+w_ie where it is modelled,
 
     f_b = R_bn (a_n + 2 w_ie x v_n - g_n) + alpha x l + w x (w x l) + 2 w_ie x (w x l)
     y   = R_sb ([f_b, w + R_bn w_ie] + bias) + noise
@@ -13,7 +12,7 @@ At the lever arm l, with the Earth's rate w_ie where it is modelled,
 which is (3.14) with alpha x l kept and the sign of gravity corrected. Biases are in body
 axes, as an estimator states them, and walk from sample to sample.
 
-Errors that last: first-order Gauss-Markov processes (Gelb 1974, 3.8) that belong to calibration variables.
+Errors that last are first-order Gauss-Markov processes (Gelb 1974, 3.8) of calibration variables.
 """
 
 from collections.abc import Mapping

@@ -1,16 +1,14 @@
-"""Magnetism around a simulated vehicle: iron on the ground, and what the vehicle's own iron does.
+"""The environment of a simulated vehicle: magnetic fields of iron, and water in motion.
 
-An object of iron is a dipole of moment m at the distance r,
+An object of iron on the ground is a dipole of moment m at the distance r,
 
     B = mu0 / (4 pi |r|^3) (3 (m . u) u - m),  u = r / |r|
 
-A magnetometer feels B where it is. A compass turns with the horizontal part of the whole
-field where *it* is.
+A magnetometer measures B where it is. A compass turns with the horizontal part of the whole field where *it* is. The
+vehicle's own iron moves with the vehicle.
 
-The water that a vehicle moves in: a current and the orbits of small waves.
-
-Linear waves in deep water: a wave of amplitude A and angular frequency s moves the water at
-depth z on circles with the speed A s exp(-k z), k = s^2 / g, along its direction and, a
+The water has a current and the orbits of small waves. Linear waves in deep water: a wave of amplitude A and angular
+frequency s moves the water at depth z on circles with the speed A s exp(-k z), k = s^2 / g, along its direction and, a
 quarter of a period apart, vertically. All water around the vehicle moves as one.
 """
 

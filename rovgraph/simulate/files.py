@@ -1,7 +1,7 @@
 """A simulated dive as files.
 
-``log.csv`` what the vehicle recorded, ``config.yaml`` what an estimator may know,
-``truth.csv`` and ``truth.json`` what it may not, ``summary.json`` what was made.
+``log.csv`` is the vehicle's recording and ``config.yaml`` the estimator's configuration; ``truth.csv`` and
+``truth.json`` are hidden from the estimator; ``summary.json`` lists the options.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""A dive by the name of its scenario, with the configuration that an estimator may know."""
+"""A dive by the name of its scenario, with the configuration for an estimator."""
 
 import difflib
 from dataclasses import replace

@@ -1,36 +1,29 @@
 """iSAM2 over a whole dive: an incremental graph that is a filter at its newest keyframe and a smoother behind it.
 
 Each interval is predicted with the IMU from the graph's own newest keyframe, and measurements are gated by their
-innovations against the graph's own joint covariance there (`FilterEngine.step`, from what iSAM2 knows); what was let
-in becomes a factor, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
-are smoothed: the smoother's Gauss-Newton goes on from iSAM2's estimate until it rests.
+innovations against the graph's own joint covariance there (`FilterEngine.step`, with iSAM2's covariance); admitted
+measurements become a factor, and after the update the newest keyframe is the filtered estimate. In the end all
+keyframes are smoothed: the smoother's Gauss-Newton continues from iSAM2's estimate until it converges.
 
-Factors that were linearised at different headings and mountings claim to know what nothing has shown (Huang,
-Mourikis and Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation.
-Where attitude or calibration are off by a part of their sd, all is relinearised from there on. A constant that all
-keyframes share would make every update touch the whole tree, so each constant of the calibration is a row of nearly
-equal ones, one for each segment of time.
-
-The intervals of a dive as whitened rows about a point, which can be linearised again when the point has moved.
-
-With the errors e_i, e_j of the keyframes before and after an interval and e_c of the calibration, in the order of
-`rovgraph.inference.filter`, an interval says
+`Linearization` holds the intervals of a dive as whitened rows about a point. With the errors e_i, e_j of the keyframes
+before and after an interval and e_c of the calibration, in the order of `rovgraph.inference.filter`, the rows are
 
     A_i e_i + A_j e_j + C e_c = r + white noise
 
-in one row for each component of its motion, or of the prior, and of the measurements since the keyframe before.
-Their equations are the compiled ones, and losses weight the rows.
+one for each component of its motion, or of the prior, and of the measurements since the keyframe before. Their
+equations are the compiled ones, and losses weight the rows.
 
-Incremental smoothing over a whole dive: iSAM2 (Kaess et al. 2012) of a linearised graph.
+`Incremental` is iSAM2 (Kaess et al. 2012) of that linearised graph. Its variables are errors about the point: one for
+each keyframe, one for the calibration of each segment of time, and one for each place. An interval is one factor,
+linearised in compiled code, so that an update needs no callback and eliminates two cliques. Elimination is by QR, as
+Cholesky squares the rows of precise motions. A constant that all keyframes share would make every update touch the
+whole tree, so each segment has its own, tied to the one before by a walk of nearly zero sd.
 
-iSAM2 holds the errors about a point: one variable for each keyframe, one for the calibration of each segment of
-time, and one for each place. An interval is one factor, linearised by the compiled equations
-(`rovgraph.inference.graph.isam2`), so that an update calls nothing back and eliminates two cliques. iSAM2 does not
-relinearise by itself: `relinearize` moves the point to the estimate from some segment on and replaces the factors
-from there, which is the part of the Bayes tree that a change of these variables would take up anyway.
-
-By QR, as Cholesky squares the rows of precise motions. A constant that all keyframes share would make every update
-touch the whole tree, so each segment has its own, tied to the one before by a walk that hardly moves.
+Factors that were linearised at different headings and mountings bring spurious information (Huang, Mourikis and
+Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation. Where attitude or
+calibration are off by a part of their sd, `relinearize` moves the point to the estimate from some segment on and
+replaces the factors from there, which is the part of the Bayes tree that a change of these variables affects anyway.
+iSAM2 does not relinearise by itself.
 """
 
 from collections.abc import Callable, Mapping, Sequence

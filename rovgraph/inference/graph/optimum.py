@@ -1,13 +1,9 @@
-"""The optimum of a graph, as `rovgraph.inference.optimum` asks of any solver.
+"""The optimum of a graph and its covariances, with the interface of `rovgraph.inference.optimum`.
 
-What the data up to a time say of the calibration, from the graph's own information matrix.
-
-The dive is eliminated piece by piece in the order of time, by QR. What is left of a piece are
-conditionals of its last keyframe and of the calibration; they go into the next piece as factors.
-So every piece ends with the exact joint covariance given all data so far, every factor
-linearised at the same values, and the whole costs one elimination.
-
-How certain the optimum of a dive is: marginal covariances from its Bayes tree.
+Marginal covariances come from the Bayes tree. `knowledge` gives the information that the data up to a time hold about
+the calibration: the dive is eliminated piece by piece in the order of time, by QR. From each piece remain conditionals
+of its last keyframe and of the calibration, which are factors of the next piece. So every piece ends with the exact
+joint covariance given all data so far, every factor linearised at the same values, and the whole costs one elimination.
 """
 
 from collections.abc import Mapping, Sequence

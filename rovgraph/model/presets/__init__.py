@@ -1,7 +1,7 @@
-"""Presets: what data sheets state of an instrument, as keys and values of the configuration.
+"""Presets: instruments' data sheets as keys and values of the configuration.
 
-The YAML files beside this module hold them, a file per maker. A number stands as its data sheet states it, with its
-unit and its source; it is converted here. What no source states is not filled in.
+The YAML files beside this module hold them, a file per maker. A number is written as its data sheet states it, with
+its unit and its source; it is converted here. A value that no source states stays empty.
 """
 
 import difflib
