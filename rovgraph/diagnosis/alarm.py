@@ -1,4 +1,4 @@
-"""Alarms, advice, and the verdict that alarms come to."""
+"""Alarms, advice, and the verdict that follows from them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

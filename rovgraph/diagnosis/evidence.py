@@ -1,4 +1,4 @@
-"""What alarms look at: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
+"""Evidence for alarms: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,10 +1,8 @@
-"""Alarms on the measurements' residuals: rejected, too large, too small, and lasting in one direction.
+"""Alarms on residuals: rejected, too large, too small, correlated; and sensors that froze or contradict each other.
 
 Residuals of a smoother vary less than the noise, since each measurement has pulled the estimate towards itself:
 their covariance is I - H P H' in units of the noise. So the limits upwards are those of independent noise. Downwards
 only the filter's normalised innovations squared (NIS) can tell, whose expectation is the measurement's dimension.
-
-Alarms on the sensors themselves: those that froze, and pairs that contradict each other.
 """
 
 from collections.abc import Iterator, Sequence

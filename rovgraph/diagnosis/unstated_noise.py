@@ -1,20 +1,18 @@
-"""Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
+"""Noise and DVL lever arm that the configuration does not state, found in the residuals.
 
-Both come back as `Beliefs`, with which the dive is solved again, filter and smoother alike. So does the place of a DVL
-that is elsewhere than believed, where the gyro's noise would move it if it were estimated. A constant that is held
-wrongly makes residuals that look like either, so where alarms name one nothing is found. Late stamps of the same sensor
-are a rival: an error that lasts must make the dive likelier than these do.
+Noise may be larger than stated, or errors may last. Both are returned as `Beliefs`, with which filter and smoother
+solve the dive again. A wrong constant makes residuals that look like either, so no noise is reported where alarms name
+a constant. Late stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
 
-The factor of white noise comes from differences of successive residuals, which errors that last leave alone:
+The factor of white noise comes from differences of successive residuals, which errors that last do not change:
 
     factor^2 = median |r_k+1 - r_k|^2 / (2 m)
 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
 
-The place of a DVL that is elsewhere than the configuration has it, by the vehicle's own rates.
-
-Where the gyro's noise would move the DVL's arm if it were estimated, it is considered, and stays at its mean however
-far off that is (`rovgraph.inference.lever_arm_bias`). The score test without that noise says where the DVL is instead.
+`estimate_lever_arm` finds the DVL's lever arm from the vehicle's own rates. Where the gyro's noise would bias the arm
+if it were estimated, the arm is considered and stays at its mean, however wrong (`rovgraph.inference.lever_arm_bias`).
+The score test without that noise gives the right one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

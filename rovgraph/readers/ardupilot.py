@@ -1,10 +1,7 @@
-"""What ArduPilot's parameters say of its sensors, for its own logs and for MAVLink.
+"""ArduPilot's parameters, depth from pressure, and valid satellite fixes, for its own logs and for MAVLink.
 
-Parameters: https://ardupilot.org/sub/docs/parameters.html.
-
-Depth from pressure, and which pressure is that of the surface.
-
-Satellite fixes of an autopilot, without those that are none.
+`surface_pressure` finds which pressure is that of the surface. Parameters:
+https://ardupilot.org/sub/docs/parameters.html.
 """
 
 from collections.abc import Collection, Mapping
@@ -99,7 +96,7 @@ def depth_of(
 
 
 def surface_of(instance: int, pressure: Array, parameters: Mapping[str, float]) -> tuple[float, str, bool]:
-    """Pressure at the surface [Pa], as `rovgraph.readers.ardupilot.surface_pressure`; arguments of `depth_of`."""
+    """Pressure at the surface [Pa], by `surface_pressure`; arguments of `depth_of`."""
     names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
     return surface_pressure(next((parameters[name] for name in names if name in parameters), None), pressure)
 

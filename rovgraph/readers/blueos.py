@@ -1,4 +1,4 @@
-"""MCAP recordings of BlueOS: MAVLink messages as JSON, as mavlink2rest writes them, and what else a companion says.
+"""MCAP recordings of BlueOS: MAVLink messages as JSON, as mavlink2rest writes them, and other topics of a companion.
 
 A message stands on the topic ``mavlink/<system>/<component>/<NAME>`` and, in some versions, a second time on
 ``mavlink/out``. Names of enumerations stand for their numbers, and extensions of MAVLink 2 may be missing. Sources:

@@ -1,14 +1,13 @@
-"""Several recordings on one clock, that of the IMU; or Unix time, where the IMU's clock is known in it.
+"""Joins several recordings on one clock: the IMU's, or Unix time where the IMU's clock is known in it.
 
-Clocks of one file whose Unix time is known, or that share arrivals, form an axis. Axes are joined by what the user
-knows (a shift), by Unix time, or by the motion that both show (`synchronise`); what motion contradicts by more than
+Clocks of one file whose Unix time is known, or that share arrivals, form an axis. `join_clocks` joins axes by a shift
+that the user states, by Unix time, or by the motion that both show; a shift that motion contradicts by more than
 `AGREE_S` is corrected, with a warning.
 
-How far two clocks are apart, by the motion that both recordings show.
-
-Every lag is searched first (`comparisons`). The best one counts where it explains the motion far better than any
-other, and least squares then give the offset and the drift with their standard deviations, these by leaving out one
-part of the dive after the other.
+`find_offset` finds the offset of two clocks by the motion that both recordings show. It searches all lags first
+(`rovgraph.readers.lag_search`). The best lag is accepted where it explains the motion far better than any other, and
+least squares then give the offset and the drift with their standard deviations, these by leaving out one part of the
+dive after the other.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,9 +1,7 @@
-"""ArduPilot's own logs, DataFlash ``.BIN``: what a vehicle with ArduSub records on board.
-
-What the messages of a DataFlash log say of each sensor, in SI.
+"""ArduPilot's own logs, DataFlash ``.BIN``, which a vehicle with ArduSub records on board: each sensor's values in SI.
 
 Fields and their meaning: https://ardupilot.org/sub/docs/logmessages.html. Vectors are along the vehicle's axes,
-forward, starboard, down: ArduPilot turns what its sensors say by their orientation.
+forward, starboard, down: ArduPilot turns its sensors' values by their orientation.
 """
 
 from collections import Counter

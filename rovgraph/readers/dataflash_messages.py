@@ -1,6 +1,6 @@
 """Messages of an ArduPilot DataFlash log as arrays, many at a time.
 
-A log is a row of messages: 0xA3 0x95, a type, and as many bytes as the type's format says. Formats are messages
+A log is a row of messages: 0xA3 0x95, a type, and as many bytes as the type's format states. Formats are messages
 themselves (FMT); units and multipliers of their fields too (UNIT, MULT, FMTU). There are no checksums. Source:
 https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html and libraries/AP_Logger of ArduPilot.
 

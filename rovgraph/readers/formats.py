@@ -1,8 +1,7 @@
 """Native formats, recognised by their content: one module each, registered here or by an entry point.
 
-A package of its own adds a format with an entry point of the group ``rovgraph.formats`` that names a `Format`.
-
-What a file is that is given as a log and is none, and which command reads it.
+A package of its own adds a format with an entry point of the group ``rovgraph.formats`` that names a `Format`. Files
+that are not logs are explained, with the command that reads them.
 """
 
 import gzip

@@ -1,4 +1,4 @@
-"""What inertial units export, as channels of a log: units of columns, axes, and the world of an attitude.
+"""Exports of inertial units as channels of a log: units of columns, axes, and the world of an attitude.
 
 Where a file states no unit, that of the maker's documentation counts, unless gravity or an instrument's range rules it
 out. Gravity also tells whether z points up, and whether an attitude is relative to NED or to ENU.

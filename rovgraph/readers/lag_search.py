@@ -1,4 +1,4 @@
-"""Two recordings of one motion: how well what one shows is explained by what the other shows, at any lag.
+"""Lag search between two recordings of one motion: how well one explains the other, at any lag.
 
 For a quantity y on clock A and the same one x on clock B, both as changes over a window,
 
@@ -11,13 +11,11 @@ DVL's arm from the IMU,
 
 The sums of these least-squares problems at all lags come from FFTs. R is then the best of a set of rotations that is
 dense enough for any mounting at right angles, and any about the vertical, each with the arm that fits it best. In waves
-the arm's part may be most of the motion: it counts for no lag.
+the arm's part may be most of the motion: it is not counted in favour of a lag.
 
-The motion that the sensors on one clock show, in quantities that need no mounting to be compared.
-
-Turning about the vertical, depth, speed, the velocity along a DVL's own axes, and the IMU's acceleration without
-gravity along its own axes. Integrated quantities are compared by their changes over a window, so that biases and
-constant offsets drop out.
+The quantities compared need no mounting: turning about the vertical, depth, speed, the velocity along a DVL's own axes,
+and the IMU's acceleration without gravity along its own axes. Integrated quantities are compared by their changes over
+a window, so that biases and constant offsets drop out.
 """
 
 from dataclasses import dataclass

@@ -1,16 +1,12 @@
-"""What MAVLink messages of an autopilot say of its sensors: one table for live links and for recordings.
+"""MAVLink messages of an autopilot as readings of its sensors, for live links and for recordings.
 
 Sources: the message definitions at https://mavlink.io/en/messages/common.html; units of RAW_IMU as ArduPilot fills
 it. Values come in the order of `COLUMNS`, in SI and radians; vectors along the vehicle's axes, forward, starboard,
-down; headings from true north.
+down; headings from true north. `MavlinkRows` collects recorded messages as arrays.
 
-What recorded MAVLink messages said, as arrays.
-
-MAVLink frames, in a stream of bytes and in telemetry logs.
-
-A frame begins with a marker and its length; behind a byte that only looks like a marker, the
-search goes on with the next byte, so that noise costs no good frame. In a telemetry log (``.tlog``) a time stands
-before each frame.
+`MavlinkFrames` finds frames in a stream of bytes and in telemetry logs. A frame begins with a marker and its length;
+after a byte that only looks like a marker, the search continues at the next byte, so that noise costs no good frame. In
+a telemetry log (``.tlog``) a time precedes each frame.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""MAVLink messages that somebody received and recorded, as a recording: of telemetry logs and of BlueOS."""
+"""Recorded MAVLink messages as a recording: of telemetry logs and of BlueOS."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping

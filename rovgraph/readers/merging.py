@@ -1,6 +1,6 @@
-"""Recordings of one dive become one log: sensors selected, clocks joined, rows in the order of time.
+"""Merges recordings of one dive into one log: sensors selected, clocks joined, rows in the order of time.
 
-An account of what was made of files: what each held, where every column came from, and how clocks were joined.
+`account` lists the contents of each file, the origin of every column, and how clocks were joined.
 """
 
 import warnings as python_warnings

@@ -1,8 +1,6 @@
-"""Bottom and water tracks of Nortek's DVLs, as channels of a log.
+"""Nortek's binary records, found by their two checksums, and bottom and water tracks as channels of a log.
 
 Velocities are those of the instrument, along its X, Y and Z: forward, starboard and down as it is drawn.
-
-Records of Nortek's binary files and streams, found by their two checksums.
 
 Source: Nortek AS, Signature Integrator's Guide N3015-007, DVL Integrator's Guide N3015-009, Nucleus Integrator's Guide
 N3015-046. dolfyn 1.3 does not import beside NumPy 2 and skips the records of DVLs; nucleus-driver makes a dictionary of

@@ -4,13 +4,12 @@ Bottom track is the velocity of the bottom against the instrument; a log has the
 forward (beam 3, or the ship's bow), starboard, down, whatever the file's are (`rovgraph.readers.trdi`).
 
 WinRiver and VmDas write a receiver's fixes beside the pings, with their time of day (UTC) and how long before the ping
-they came. So the file tells how far the instrument's clock is off. Sources: Teledyne RD Instruments, WinRiver II User's
+they came, which gives the error of the instrument's clock. Sources: Teledyne RD Instruments, WinRiver II User's
 Guide, General NMEA data; VmDas User's Guide, navigation data.
 
-Ensembles of Teledyne PD0 files, found by their checksums, and their records as structured arrays.
-
-Source: Teledyne RD Instruments, Workhorse Commands and Output Data Format, P/N 957-6156-00, chapter 8. dolfyn 1.3 does
-not import beside NumPy 2, and keeps one coordinate system for a file.
+Ensembles are found by their checksums, and their records become structured arrays. Source: Teledyne RD Instruments,
+Workhorse Commands and Output Data Format, P/N 957-6156-00, chapter 8. dolfyn 1.3 does not import beside NumPy 2, and
+keeps one coordinate system for a file.
 """
 
 import mmap

@@ -1,12 +1,11 @@
-"""What one native file holds, before clocks are joined: channels of a log, and an account of the rest.
+"""The contents of one native file, before clocks are joined: channels of a log, and an account of the rest.
 
 A reader (`rovgraph.readers.formats.Format`) turns a file into a `Recording`. Times stay on the file's own
-clocks, units become SI and radians, vectors stay in the instrument's axes: what these are is said in words
-(`Channel.frame`) and as a piece of configuration (`Recording.settings`), never mended by a sign in code.
+clocks, units become SI and radians, vectors stay in the instrument's axes: these are stated in words
+(`Channel.frame`) and as a piece of configuration (`Recording.settings`), never changed by a sign in code.
 
-Whether an inertial unit was recorded often enough.
-
-Several sources of one sensor's measurements: which comes first.
+`too_slow` tells whether an inertial unit was recorded often enough; `preferred_first` orders several sources of one
+sensor's measurements.
 """
 
 from collections.abc import Mapping, Sequence

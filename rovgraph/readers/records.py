@@ -1,6 +1,6 @@
-"""What stands in a line of text: JSON objects and their numbers, and lines that are not taken.
+"""Lines of text and binary records: JSON objects and their numbers, refused lines, structured arrays.
 
-Records of one kind that lie anywhere in a binary file, as one structured array.
+Binary records of one kind may lie anywhere in a file; they become one structured array.
 """
 
 import json

@@ -1,11 +1,10 @@
-"""ROS 1 bags and ROS 2 bags (SQLite, MCAP), without ROS: what sensors say in them.
+"""ROS 1 bags and ROS 2 bags (SQLite, MCAP) as recordings, without ROS.
 
 A message is decoded by the definition that its bag carries, else by that of rosbags, else by one of
-`rosbag_messages.DEFINITIONS`. Topics that tell of no sensor, images among them, are counted and never decoded.
+`rosbag_messages.DEFINITIONS`. Topics without sensor data, images among them, are counted and never decoded.
 
-Mountings and lever arms from ``/tf_static`` (REP 103: x forward, y left, z up; REP 105: base_link).
-
-From what a bag's topics say to a recording: which topic feeds a sensor, by which clock, in which axes.
+`recording` chooses which topic feeds a sensor, by which clock, in which axes. Mountings and lever arms come from
+``/tf_static`` (REP 103: x forward, y left, z up; REP 105: base_link).
 """
 
 import struct

@@ -1,13 +1,12 @@
-"""ROS messages that tell of a sensor: from a message to the columns of a log.
+"""ROS messages of sensors as columns of a log.
 
-Values stay in the axes of the message's frame; what a covariance of -1 means is said by each type's own definition.
+Values stay in the axes of the message's frame; each type's own definition states what a covariance of -1 means.
 Units of ROS are SI (REP 103): https://www.ros.org/reps/rep-0103.html.
 
-ROS messages of a Nortek Nucleus: its packets, as the maker's driver passes them on unchanged.
-
-They have no header: ``timestamp`` and ``microseconds`` are the instrument's, ``system_timestamp`` the driver's. Axes
-and units are those of `rovgraph.readers.nucleus`. Source: github.com/NortekSupport/nucleus_driver,
-ros2/src/interfaces/msg; the package is called ``interfaces``, so messages of others may have its types.
+Messages of a Nortek Nucleus are its packets, which the maker's driver passes on unchanged. They have no header:
+``timestamp`` and ``microseconds`` are the instrument's, ``system_timestamp`` the driver's. Axes and units are those of
+`rovgraph.readers.nucleus`. Source: github.com/NortekSupport/nucleus_driver, ros2/src/interfaces/msg; the package is
+called ``interfaces``, so messages of others may have its types.
 """
 
 import math

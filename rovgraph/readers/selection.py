@@ -1,8 +1,8 @@
-"""Which files are pieces of one source, and which channel feeds each sensor of a log, where several could.
+"""Joins the pieces of one source, and selects the channel that feeds each sensor of a log, where several could.
 
 Two files are pieces of one source where format, sensors and columns agree, and their spans overlap by less than a tenth
 of the shorter: split bags, hourly files, logs that are cut at midnight. They become one recording in the order of time,
-whatever the order in which they were given; what they share is taken once, and what is missing between them is a gap.
+whatever the order in which they were given; an overlap is taken once, and time missing between them is a gap.
 """
 
 import re

@@ -1,10 +1,8 @@
-"""Stamps of a channel that are put in order, by `rovgraph.log.stamps` and by the arrivals that a recorder kept.
+"""Puts the stamps of a channel in order, by `rovgraph.log.stamps` and by the arrivals that a recorder kept.
 
-The clock of whoever receives an autopilot's messages, by the autopilot's own.
-
-A vehicle's companion has no clock that runs while it is off, so its clock jumps once it learns the time; a link
-stalls, and then delivers what it held. The least delay (received - boot time) tells them apart: a stall leaves it as
-it was.
+`receiver_clock` corrects the clock of the receiver of an autopilot's messages by the autopilot's own. A vehicle's
+companion has no clock that runs while it is off, so its clock jumps once it receives the time; a link stalls, and then
+delivers the delayed messages. The least delay (received - boot time) distinguishes them: a stall does not change it.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""MAVLink telemetry logs (``.tlog``): what a ground station has received."""
+"""MAVLink telemetry logs (``.tlog``), which a ground station records."""
 
 import mmap
 from pathlib import Path

@@ -2,7 +2,7 @@
 
 Values are m/s2, rad/s, gauss and degrees relative to NED (user manuals of VN-100 and VN-200). A status ``S0000`` and a
 counter ``T0000543`` may follow them. Only ``$VNINS`` and ``$VNGPS`` have a time, so a sentence is stamped by, in this
-order: what a logger wrote before it, a counter of microseconds, its place between sentences with a time, or its number
+order: a logger's time before it, a counter of microseconds, its place between sentences with a time, or its number
 and the rate that the answer to ``$VNRRG,07`` states.
 """
 

@@ -1,9 +1,7 @@
-"""Files of Water Linked's DVLs: JSON lines as their TCP port sends them, or the same reports as rows of a CSV.
+"""Reports of Water Linked's DVLs, live and in files: JSON lines as their TCP port sends them, or rows of a CSV.
 
 The CSV is that of the maker's own script, https://github.com/waterlinked/dvl-python, whose ``log_time`` is of arrival,
 in microseconds of the recorder's Unix time.
-
-Reports of Water Linked's DVLs, as they send them (JSON over TCP) or as they were written into a file.
 
 Source: https://docs.waterlinked.com/dvl/dvl-protocol: ``time_of_validity`` is that of the reflection,
 ``time_of_transmission`` when the report leaves the DVL, both in microseconds of its clock; ``time`` is the

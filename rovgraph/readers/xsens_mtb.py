@@ -2,8 +2,8 @@
 
 A message is ``FA``, bus, kind, length, data and a sum; bus to sum add up to 0 modulo 256. MTData2 is a sequence of
 items: an identifier of two bytes, a size and big-endian numbers, whose last nibble names their precision (float, fixed
-point 12.20 or 16.32, double) and the world of an attitude (ENU, NED, NWU). What it says goes where the text export's
-columns go (`rovgraph.readers.xsens`).
+point 12.20 or 16.32, double) and the world of an attitude (ENU, NED, NWU). Its items feed the same columns as the text
+export (`rovgraph.readers.xsens`).
 """
 
 import mmap

@@ -1,12 +1,11 @@
-"""Is this log sane? And what would an estimate make of it?
+"""Checks of a log before an estimate: units, signs, axes, clocks, contradictions.
 
-`examine` runs every check of `CHECKS` and collects what they find; `warn` is for commands
-that go on to work with the log. A check takes a log and a configuration and yields
-findings; it knows nothing of other checks.
+`examine` runs every check of `CHECKS` and collects the findings; `warn` is for commands that then work with the log. A
+check takes a log and a configuration and yields findings, independently of other checks. Begin with `values` (one
+sensor by itself) and `agreement` (two sensors of one motion).
 
-What an estimate would make of a log: heading sources, keyframes, assumptions.
-
-Places seen before: how often each was, since one that is seen once adds no information.
+`plan` is a preview of the estimate: heading sources, keyframes, assumptions. `places` counts the sightings of each
+place, since a place seen once adds no information.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,6 +1,6 @@
-"""Whether sensors that see the same motion agree: sign, scale, and clock.
+"""Agreement of sensors that measure the same motion: sign, scale, and clock.
 
-Each comparison takes what two sensors say of the change within windows of some seconds
+Each comparison takes the changes that two sensors measure within windows of some seconds
 (`rovgraph.diagnosis.check.lags`).
 """
 

@@ -1,14 +1,14 @@
-"""Which sensors there are, and when their measurements came.
+"""Clocks of a log: which sensors it has, when they measured, and clocks that jump or have different epochs.
 
-Clocks that jump within a dive: where the DVL's lag against the IMU is another before and after a gap of one of them.
+`presence`, `overlap` and `regularity` list sensors and the times of their measurements.
 
-A clock that is set leaves a gap in the stamps of the instrument that it belongs to. Where the lag before and after is
-known, and the gap says whose clock it is, the later stamps are put back by the difference (`bridge_jumps`).
+`find_jump` finds clocks that jump within a dive, where the DVL's lag against the IMU differs before and after a gap of
+one of them. A clock that is set leaves a gap in the stamps of its instrument. Where the lag before and after is known,
+and the gap shows whose clock it is, `bridge_jumps` corrects the later stamps by the difference.
 
-How far apart the clocks of two recordings are that share no time: by the motion that both show.
-
-The stream is first put where its start meets that of the IMU; what is left, up to minutes, is searched for as between
-clocks of one epoch. So clocks may be any time apart, if the recordings are of one dive.
+`shift_of_epoch` finds the shift between recordings whose clocks have no common epoch, by the motion that both show. The
+stream is first put where its start meets that of the IMU; the remainder, up to minutes, is searched as between clocks
+of one epoch. So clocks may be any time apart, if the recordings are of one dive.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,13 +1,13 @@
 """The vehicle's heading by each compass, and which axes of the magnetometer agree with the gyro.
 
-In the IMU's axes the Earth's field turns as m' = -w x m. With y what is measured, c its hard iron and m = H (y - c) for
-a signed permutation H,
+In the IMU's axes the Earth's field turns as m' = -w x m. With y the measured field, c its hard iron and m = H (y - c)
+for a signed permutation H,
 
     y' = -A w x (y - c),  A = det(H) H',
 
-so H and -H are alike, which the field's dip decides, and A is a rotation. One that is not belongs to the gyro, and so
-does one that turns gravity as well. Changes over some seconds are compared, with c and the gyro's bias free. A vehicle
-that turns about one axis only leaves several A alike.
+so H and -H fit equally, which the field's dip decides, and A is a rotation. If A is not a rotation, or turns gravity as
+well, the gyro's axes are wrong. Changes over some seconds are compared, with c and the gyro's bias free. In a dive that
+turns about one axis only, several A fit equally.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
 """The DVL against the IMU by their accelerations: axes, mounting, clock, and jumps of a clock.
 
-Nothing else is needed: no heading, no depth, no change of depth.
+The check needs neither heading nor depth.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a check has to say, and helpers that the checks share."""
+"""Findings of a check, and helpers that the checks share."""
 
 import math
 from dataclasses import asdict, dataclass

@@ -1,14 +1,13 @@
-"""The DVL's track, turned by a heading, against position fixes.
+"""Position fixes against the DVL's track, turned by a heading, and against the configured start.
 
 In the plane as complex numbers: a fix is ``p + c D(t - tau)`` with ``D`` the sum of ``exp(i psi) v dt``. ``arg c`` is
 the error of heading and mounting, ``|c|`` the scale, ``tau`` how late the fixes are, and ``p`` is free in each stretch
 of some minutes, since D drifts. Fixes of swapped north and east fit the conjugate of D; a DVL whose y axis is mirrored
-fits better with the conjugate velocity. A cause is named where it explains the fixes beyond what chance does.
+fits better with the conjugate velocity. A cause is named where it explains the fixes better than chance.
 
-The start that a configuration states, against the first position fixes.
-
-The vehicle cannot be further from its start than the way that the DVL has measured since. Fixes of another origin, or
-turned by a wrong heading of the ship, begin somewhere else.
+`start` compares the configured start with the first fixes. The vehicle cannot be further from its start than the
+distance that the DVL has measured since. Fixes of another origin, or turned by a wrong heading of the ship, begin
+somewhere else.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The motion that the IMU alone shows, on even times: rates, level, and acceleration without gravity.
+"""Motion from the IMU alone, at even times: rates, level, and acceleration without gravity.
 
 The gyro gives the attitude relative to that at the start, ``R_gb``, which drifts slowly. There the mean specific force
 of some 20 s is gravity (upwards), since no vehicle accelerates for so long; it turns with the gyro's bias ``b``,

@@ -1,12 +1,11 @@
-"""Lags and axes between sensors that show one motion: what all comparisons share.
+"""Lags and axes between sensors that measure one motion, for all comparisons.
 
-Cross-correlations of whole dives by FFT, the lag at which one is largest, the ways to name axes, and normal equations
-of the parts of a dive: leaving out one after the other shows how much a fit depends on it, without a model of what two
-sensors do not share.
+Cross-correlations of whole dives by FFT, the lag of the largest, the possible orders of axes, and normal equations
+of the parts of a dive: leaving out one after the other shows how much a fit depends on it, without a model of the
+errors that two sensors do not share.
 
-How much later one signal is than another, and their slope, by the changes of both within windows.
-
-The fit is ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
+`lag` finds how much later one signal is than another, and their slope, by the changes of both within windows. The fit
+is ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Whether the values of each sensor are possible: gravity, units, ranges, bottom lock.
-
-Measurements that are none although the vehicle moves: what an estimate leaves out.
-"""
+"""Values of each sensor by itself: gravity, units, ranges, bottom lock, and invalid measurements."""
 
 from collections.abc import Iterator, Sequence
 

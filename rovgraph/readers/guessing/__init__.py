@@ -1,8 +1,8 @@
-"""A mapping of the columns of anyone's table, proposed by names, ranges and physics (docs/formats.md).
+"""Proposes a mapping of the columns of any table, by names, ranges and physics (docs/formats.md).
 
-What the columns of anyone's table may be: names propose, ranges and physics decide units and raise doubt.
-
-A column whose name says nothing is at most unsure, whatever its numbers look like.
+Names propose; ranges and physics decide units and raise doubt. A column whose name is not recognised is marked unsure
+at best, whatever its numbers. Begin with `names` (words of a column's name), then `groups` (columns by sensor and source)
+and `quantities`. May import what `rovgraph.readers` may.
 """
 
 from collections.abc import Mapping

@@ -1,13 +1,11 @@
-"""The columns of a table by sensor and source, and what is proposed for each.
+"""The columns of a table by sensor and source, the proposal for each, and their units by ranges and physics.
 
-Units of foreign columns by ranges and physics.
-
-Gravity gives the unit of a specific force; what turns by one sensor turns by another, which gives the unit of a gyro,
+Gravity gives the unit of a specific force. A gyro's unit follows from the turns of another sensor,
 
     d(heading)/dt = b w . down,    d(f)/dt = -b w x f,
 
-and what sinks by the DVL sinks by the pressure sensor. Changes of means over a second are compared, so that offsets
-and biases drop out.
+and a DVL's from the sinking by the pressure sensor. Changes of means over a second are compared, so that offsets and
+biases drop out.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

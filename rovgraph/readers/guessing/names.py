@@ -1,7 +1,7 @@
-"""What the name of a column in anyone's table says: the column of a log that it may be, its source and its unit.
+"""Names of columns in any table: the column of a log that each may be, its source and its unit.
 
 A name is read as words: split at signs, blanks and capitals, and where an axis is glued to a known word (``xacc``,
-``wx``). Words decide; numbers are not looked at here.
+``wx``). Only words are used here, not the numbers.
 """
 
 import re

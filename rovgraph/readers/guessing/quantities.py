@@ -1,6 +1,6 @@
-"""Inertial columns and angles: gravity gives the unit of a force, and gyro and heading give each other's.
+"""Quantities of foreign columns: inertial columns and angles, velocity and depth, altitude and fixes.
 
-Velocity and depth, which give each other's unit; altitude and fixes.
+Gravity gives the unit of a specific force; gyro and heading, and velocity and depth, give each other's.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
