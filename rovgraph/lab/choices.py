@@ -1,4 +1,4 @@
-"""What a person gives to a study of the calibration: names, goals, what is known already."""
+"""Options of a study of the calibration: names, goals, known components."""
 
 import difflib
 import json

@@ -1,15 +1,10 @@
-"""Any set of estimators on any set of dives: what ``rovgraph compare`` does.
+"""Any set of estimators on any set of dives: the work of ``rovgraph compare``.
 
-From a row per run and estimator to a row per estimator.
-
-The mean NEES of N independent runs at their ends, 2 components each, is chi-square with
-2 N degrees of freedom over N for covariances that are right (Bar-Shalom et al. 2001, 5.4.2). Along a
-track errors are correlated, so the mean there has no such band.
-
-The measures of one estimate against a reference: a row of runs.csv.
-
-Position errors and their consistency are those of `rovgraph.evaluate`, at the reference's
-epochs; docs/compare.md says what each column means.
+`measures` makes a row of runs.csv from one estimate and a reference: position errors and their consistency are those of
+`rovgraph.lab.evaluate`, at the reference's epochs; docs/compare.md describes the columns. `aggregate` makes a row per
+estimator of these rows. The mean NEES of N independent runs at their ends, 2 components each, is chi-square with 2 N
+degrees of freedom over N for covariances that are right (Bar-Shalom et al. 2001, 5.4.2). Along a track errors are
+correlated, so the mean there has no such band.
 """
 
 import math

@@ -1,11 +1,9 @@
-"""Where the runs of a study are made: on this machine, or on a Dask cluster.
+"""Executors of a study's runs: a pool of processes on this machine, or a Dask cluster.
 
-On one machine a pool of processes is all that is needed; it is at hand without another
-library, starts in a second and uses no ports. What a pool lacks is done here: when one of its
-processes is killed, it breaks as a whole and is made again. A cluster's scheduler does that by
-itself, so for more than one machine there is Dask, and nothing of it is repeated here.
-
-Work spread over the machine's cores, in processes that end when they are no longer wanted.
+On one machine a pool of processes suffices; it needs no other library, starts in a second and uses no ports. When one
+of its processes is killed, a pool breaks as a whole: `Local` makes it again. A cluster's scheduler does that by itself,
+so for more than one machine there is Dask. `in_workers` spreads work over the machine's cores, in processes that end
+with it.
 """
 
 import contextlib

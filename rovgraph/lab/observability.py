@@ -1,12 +1,11 @@
-"""What of the calibration a dive can show: what ``rovgraph observe`` does.
+"""Observability of the calibration in a dive: the work of ``rovgraph observe``.
 
-From the graph's own information matrix: states are marginalised exactly, by QR, and what
-noise in the estimate feigns, the spurious information, is removed (`rovgraph.inference.observability`).
+From the graph's own information matrix: states are marginalised exactly, by QR, and the spurious
+information of noise in the estimate is removed (`rovgraph.inference.observability`).
 
-Directions of the calibration that a dive leaves open, and the same in words.
-
-An eigenvector of the information, in units of the prior's sd, is a combination of components
-that the data see by itself; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
+`directions` finds the directions of the calibration that a dive leaves open; `in_words` describes them. An eigenvector
+of the information, in units of the prior's sd, is a combination of components that the data determine independently of
+the others; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
 """
 
 import difflib

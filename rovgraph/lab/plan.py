@@ -1,10 +1,8 @@
-"""What to drive to know the calibration: what ``rovgraph plan`` does.
+"""Ranks manoeuvres by how well they determine the calibration: the work of ``rovgraph plan``.
 
-The information of a dive depends on where it is linearised, not on the noise that comes. So a
-manoeuvre is driven without noise by a vehicle with the believed sensors, the graph is
-linearised there, and what is known already is added.
-
-Manoeuvres to choose from: scenarios of the simulator, each at some speeds.
+The manoeuvres are scenarios of the simulator, each at some speeds. The information of a dive depends on where it is
+linearised, not on the noise. So a manoeuvre is simulated without noise for a vehicle with the configured sensors, the
+graph is linearised there, and the information that you already have is added.
 """
 
 from collections.abc import Callable, Mapping, Sequence

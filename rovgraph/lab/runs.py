@@ -1,4 +1,4 @@
-"""What a study runs its estimators on: a recorded dive, or one that is simulated where it is needed."""
+"""Dives for the runs of a study: recorded, or simulated where they are needed."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol

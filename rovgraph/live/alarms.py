@@ -1,8 +1,8 @@
-"""Alarms while a dive goes on: the statistics of `rovgraph.diagnosis` on what the filter has met lately.
+"""Alarms while a dive goes on: the statistics of `rovgraph.diagnosis`, of the filter's last minute.
 
-Looked at are keyframes that the lag has passed. Rejections and mean squares of innovations are those of the last
-minute. One innovation of each sensor and keyframe, the first, enters the statistic of lasting errors: between keyframes
-they are independent where the filter is right, within one they share the error of its prediction.
+They use keyframes that are older than the lag. Rejections and mean squares of innovations are those of the last
+minute. The first innovation of each sensor and keyframe enters the statistic of correlated noise: between keyframes
+innovations are independent where the filter is right, within one they share the error of its prediction.
 """
 
 from collections import deque

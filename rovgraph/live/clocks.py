@@ -1,20 +1,19 @@
-"""Many clocks become one.
+"""Converts the stamps of all sources to the estimator's clock.
 
-The estimator's time is that of the clock that stamps the IMU. Any other clock is compared
-with it by way of the host's: the least delay between a message's leaving and its arrival, of the
-last minute, is taken for the transport, which is the same for all. An instrument that says when it
-sent a message, too, has its processing taken off, so that only the transport is left; of others the
-stamp stands for the leaving. Two clocks that agree from the start within `AGREE_S` (`AGREE_SENT_S` where
-the transport alone is left) are taken for synchronised, and their stamps believed to the
-millisecond; what they drift apart later is put right. Clocks that do not agree (seconds since
-switching on, say) are shifted by the difference of their least delays.
+The estimator's time is that of the clock that stamps the IMU. Any other clock is compared with it through the host's:
+the least delay between a message's sending and its arrival, of the last minute, is taken as the transport delay, which
+is the same for all. Where an instrument also reports when it sent a message, its processing time is subtracted, so that
+only the transport delay remains; for others the stamp counts as the time of sending. Two clocks that agree from the
+start within `AGREE_S` (`AGREE_SENT_S` where only the transport delay remains) are taken as synchronised, and their
+stamps as accurate to the millisecond; later drift is corrected. Clocks that do not agree (seconds since switching on,
+say) are shifted by the difference of their least delays.
 
-The stamps of recordings are believed. Those of another epoch than the IMU's are shifted by the recorded arrivals, and
-refused where these do not tell.
+The stamps of recordings are used unchanged. Stamps of another epoch than the IMU's are shifted by the recorded
+arrivals, and refused without them.
 
-A stamp that is suddenly seconds off is left out. When the stamps go on like that, the clock
-was set: it is shifted, so that time goes on. A counter that wraps goes on at once. Stamps that stand
-still for `STILL_S` while messages come are not used any more: arrivals are, until the stamps move on.
+A stamp that is suddenly seconds off is left out. When the following stamps agree with it, the clock was set: it is
+shifted, so that time is continuous. A counter that wraps is continued at once. Stamps that stand still for `STILL_S`
+while messages arrive are replaced by the arrivals, until the stamps move on.
 """
 
 from collections import deque

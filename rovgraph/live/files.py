@@ -1,25 +1,17 @@
-"""What a run of the online mode has on disk, so that a crash loses no more than a second.
+"""Files of a run of the online mode: recording, checkpoint and track, so that a crash loses no more than a second.
 
-The state of a running estimate on disk, so that it goes on after a crash.
+`Recorder` writes all received data as a log that ``rovgraph smooth`` reads. Rows are in the order of arrival, which the
+last column, ``received``, holds. Cells hold the shortest decimals that give the same number again, so that a replay
+gets the same values as the live run. `Recorder.write` only formats and queues. One thread hands rows to the operating
+system, so that a crash of the program loses no more than `FLUSH_S`; another has them put on the disk, which may take
+seconds on a memory card.
 
-A file is one line of text, ``rovgraph checkpoint VERSION DIGEST``, and a body to which the
-digest (SHA-256) belongs: the length of a JSON text in 8 bytes, little-endian; that text, in
-which an array stands as ``{"$array": [dtype, shape, offset]}``; the arrays' bytes. Nothing in
-it can run code when it is read.
+`Keeper` writes a checkpoint, the state of the running estimate, once a second without delaying the estimate;
+``--resume`` continues from it. Its file is one line of text, ``rovgraph checkpoint VERSION DIGEST``, and a body to
+which the digest (SHA-256) belongs: the length of a JSON text in 8 bytes, little-endian; that text, in which an array
+stands as ``{"$array": [dtype, shape, offset]}``; the arrays' bytes. Reading it cannot run code.
 
-Checkpoints once a second, without holding up the estimate.
-
-Everything that was received, as a log that ``rovgraph smooth`` reads.
-
-Rows stand in the order of arrival; the last column, ``received``, tells that to whoever reads
-the log. Cells hold the shortest decimals that give the same number again, so that a replay
-sees what was seen live.
-
-`Recorder.write` only formats and queues. One thread hands rows to the operating system, so
-that a crash of the program loses no more than `FLUSH_S`; another asks for them to be put on
-the disk, which may take seconds on a memory card.
-
-The filtered trajectory, written while it grows.
+`TrackFile` appends the filtered trajectory as it grows.
 """
 
 import contextlib

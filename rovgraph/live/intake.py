@@ -1,8 +1,7 @@
-"""From what a source says to measurements as the estimator takes them.
+"""From readings to measurements for the estimator: preprocessing, the first seconds, and late sensors.
 
-The first seconds: what an estimator has to know before it can begin.
-
-Sensors that begin after the first seconds: the filter goes on with what they need in its state.
+`Intake` applies the calibration that an estimator expects. `Startup` collects the first seconds until the estimator has
+its initial conditions. Sensors that begin later join: the filter continues with their calibration in its state.
 """
 
 import math

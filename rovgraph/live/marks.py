@@ -1,6 +1,6 @@
-"""Marks and way-points that a person drops while a dive goes on.
+"""Marks, way-points and a person's commands while a dive goes on.
 
-What a person says to a dive that goes on. Commands come through the feed, between messages of the sources.
+Commands arrive through the feed, between messages of the sources.
 """
 
 import csv

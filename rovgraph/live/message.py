@@ -1,4 +1,4 @@
-"""What a source says at one time, and from the cells of a row to readings."""
+"""Messages from live sources, and parsing of log rows into readings."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

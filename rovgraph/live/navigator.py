@@ -1,7 +1,7 @@
-"""From messages to navigation solutions: everything of the online mode but its connections.
+"""From messages to navigation solutions: the online mode without its connections.
 
-A message's time is reconciled, its readings are looked at for faults, and go to the engine.
-`Navigator.solution` carries the newest keyframe on to the present with the IMU.
+A message's stamp is converted to the estimator's clock, its readings are screened for faults and passed to the filter.
+`Navigator.solution` propagates the newest keyframe to the present with the IMU.
 """
 
 import math

@@ -1,7 +1,7 @@
-"""The filter goes on from the smoothed dive so far, which a thread computes while measurements come.
+"""Re-initialises the filter from the smoothed dive so far, which a thread computes while measurements arrive.
 
-The smoothed dive also shows what the filter cannot: constants that are held wrongly, and errors that last. It is
-examined as `rovgraph smooth` examines a whole dive, for alarms.
+The smoothed dive also shows wrong constants and errors that last, which the filter cannot show. It is examined for
+alarms, as `rovgraph smooth` examines a whole dive.
 """
 
 import time as host

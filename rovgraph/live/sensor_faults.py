@@ -1,26 +1,23 @@
-"""Sensors that fail while they go on talking, or fall silent.
+"""Detects sensors that freeze, lose lock, contradict each other or stop sending, while a dive goes on.
 
-What is wrong is told by the rules of a log (`rovgraph.log.frozen`) from what came before: exact zeros although
-those before were too far from zero for the vehicle to have come there, and values that are held while it moves. Those
-are left out once the limits are passed, and what was used of them is taken back. Equal values that no working DVL or
-IMU gives wait until then. What disagrees with the estimate is the filter's to reject.
+`Faults` screens readings by the rules of a log (`rovgraph.log.frozen`), against earlier ones: exact zeros although
+those before were too far from zero for the vehicle to have come there, and values that are held while it moves. They
+are left out once the limits are passed, and the ones that were used are removed. Equal values that a working DVL or IMU
+never gives are held back until then. Readings that disagree with the estimate are left to the filter's gates.
 
-The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose axes or heading are wrong.
+`Crosscheck` compares the motion of the last minutes between sensors: which stamps are late, and which axes or heading
+are wrong. It repeats the comparisons of `rovgraph check`: acceleration by DVL and IMU, turning by compasses and gyro,
+the DVL's displacement and fixes, its vertical velocity and depth. A finding of some windows in a row is reported, and
+again after half an hour if it lasts, with its figures at that time.
 
-What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
-turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What some windows in a row say
-is said, and again after half an hour if it lasts, with the figures that it then has.
+`Health` is the state of each sensor, by the filter's innovations.
 
-How the sensors are, as the filter finds them.
-
-A DVL that contradicts the estimate again and again: a false lock, or water for the bottom.
-
-The filter lets a sensor in again that was out for its `readmit_s`, and moves to where that sensor sees it: right after
-a knock, wrong where the DVL has locked onto something else. A knock is over after one such return. A DVL that is
-rejected time and again is left out from its first rejection on, and again at once if it is rejected soon afterwards:
-the filter goes back to the keyframe before and takes all other measurements since once more. Its uncertainty is then
-that of the IMU without a DVL. A DVL that was never coherent is wrongly described rather than broken: it stays in use,
-and alarms say so.
+`Incoherence` finds a DVL that contradicts the estimate again and again: a false lock, or water for the bottom. The
+filter readmits a sensor after its `readmit_s`, and moves to the sensor's value: right after a knock, wrong where the
+DVL has locked onto something else. A knock is over after one such return. A DVL that is rejected repeatedly is left out
+from its first rejection on, and again at once if it is rejected soon afterwards: the filter goes back to the keyframe
+before and processes all other measurements since again. Its uncertainty is then that of the IMU without a DVL. A DVL
+that was never coherent is probably misconfigured, not broken: it stays in use, and alarms report it.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""A run of the online mode: sources to a navigator, solutions to receivers, everything to disk.
+"""A run of the online mode: sources to a navigator, solutions to receivers, all data to disk.
 
-All sources as one stream of messages, in the order of arrival.
+`Feed` merges all sources into one stream of messages, in the order of arrival.
 """
 
 import contextlib

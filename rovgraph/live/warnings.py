@@ -1,4 +1,4 @@
-"""What sources, outputs and disks complain of: each is counted, and few are said aloud."""
+"""Counts warnings of sources, outputs and disks; reports the first ones."""
 
 import threading
 import time

@@ -1,6 +1,6 @@
 """Changes of the magnetic field that belong to the vehicle: something magnetic was attached or removed.
 
-Over seconds a gyro knows how the vehicle turned, R(t) from its axes to those of the beginning, so
+Over seconds the gyro gives the vehicle's rotation R(t) from its axes to those of the beginning, so
 
     y(t) = R(t)^T h + b(t)
 

@@ -1,4 +1,4 @@
-"""Calibration of a magnetometer from a log in which the vehicle was turned.
+"""Calibration of a magnetometer from a log in which the vehicle was turned: by an ellipsoid, or as in the thesis.
 
     field = matrix (sample - centre)
 
@@ -6,16 +6,16 @@ in IMU axes: hard iron and soft iron, (3.2) with a full matrix where the method 
 the log's: the determinant of the matrix is 1, or the field gets the length
 ``environment.field_norm`` where the configuration gives it.
 
-The ellipsoid that magnetometer samples lie on when the vehicle is turned through all directions.
+**Ellipsoid.** Turned through all directions, magnetometer samples y lie on
 
     |M (y - c)| = 1
 
 c is the hard iron, M, symmetric, soft iron and scale: (3.2) with a full matrix. The fit is least squares
 on the field's length, which are the units of the error, with a robust loss; it begins at the
 sphere that linear least squares give. A rotation between magnetometer and IMU does not change lengths,
-so it cannot be seen here.
+so it cannot be observed here.
 
-The thesis's calibration of the magnetometer: a turn about z and a turn about x (3.2)-(3.9).
+**Thesis**: a turn about z and a turn about x (3.2)-(3.9).
 
     H = gamma y + kappa,    gamma diagonal
 

@@ -1,8 +1,6 @@
-"""What is to be studied: a YAML file of cells, mostly as the product of lists.
+"""The plan of a study: a YAML file of cells, mostly as the product of lists, and the vehicle of each cell.
 
-The vehicle of a cell: what an estimator believes, and what is so.
-
-Grades of inertial units, noise densities per root hertz:
+A cell has the estimator's configuration and the true values. Grades of inertial units, noise densities per root hertz:
 
 - mti: Xsens MTi, the figures of ``rovgraph/config/falcon.yaml`` (thesis, appendix A; data sheet for the biases).
 - tactical: Sensonor STIM300 by its data sheet: 0.15 deg/rt(h), 0.06 m/s/rt(h), on-off bias of the

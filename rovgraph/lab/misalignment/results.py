@@ -1,12 +1,9 @@
-"""Run a study, or what is left of it.
+"""The results of a study: runs, or what is left of them; their rows on disk; and a row per cell.
 
-From a row per run to a row per cell: is what an estimator says of its error true?
-
-The error of N independent runs with the right sd has a mean NEES (error / sd squared, one component)
-that is chi-square with N degrees of freedom over N (Bar-Shalom et al. 2001, 5.4.2), and the
-number of runs within their 95 % interval is binomial.
-
-The rows of a study on disk, as they come: what an interrupted study goes on from.
+`Ledger` keeps the rows as they come, so that an interrupted study continues. `cell_table` compares the estimator's sds
+with its errors. The error of N independent runs with the right sd has a mean NEES (error / sd squared, one component)
+that is chi-square with N degrees of freedom over N (Bar-Shalom et al. 2001, 5.4.2), and the number of runs within their
+95 % interval is binomial.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""One run of a cell: simulate a dive, estimate it, and say what came of the misalignment."""
+"""One run of a cell: simulates a dive, estimates it, and returns the error of the misalignment."""
 
 import math
 import time

@@ -3,17 +3,14 @@
 Inertial samples come at their own epochs, pings at theirs: a ping between two samples is
 reached by a shorter step. Filters of one kind go in lock step (`timetable`), as one
 recursion over arrays with a leading axis for the filters: at 25 states a filter by itself
-spends most of its time on calling NumPy. Who is idle at a step moves by no time and
-measures nothing, which changes neither state nor covariance. So each filter does what it would do
-alone, and the others go on where one diverges.
+spends most of its time on calling NumPy. A filter that is idle at a step moves by zero time and
+skips the measurement, which changes neither state nor covariance. So each filter gives the result
+that it gives alone, and the others continue where one diverges.
 
-When the filters of a batch do what, so that they go in lock step.
-
-At each step all take an inertial sample, or all take a ping. Their logs have different
-epochs, and nothing ties one filter's time to another's; so the first pings of all are one
-step, the second ones are one step, and between them each takes the samples of its own log
-that lie there. Who has fewer of them is idle until the others are through. Pings come at
-about the same rate in all logs, so that this is little.
+At each step of the timetable all take an inertial sample, or all take a ping. The times of different
+logs are unrelated; so the first pings of all are one step, the second ones are one step, and between
+them each takes the samples of its own log that lie there. A filter with fewer of them is idle until
+the others have taken theirs. Pings come at about the same rate in all logs, so idle steps are few.
 
 A ping between two samples comes between them; at equal times the sample comes first.
 """

@@ -1,7 +1,4 @@
-"""The thesis's filters over whole logs.
-
-From the states that a recursion kept to an `Estimate`.
-"""
+"""The thesis's filters over whole logs, and an `Estimate` of the states that they keep."""
 
 import difflib
 from collections.abc import Callable, Sequence
@@ -204,7 +201,7 @@ def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory 
     -------
     Estimate : ``kind`` is the filter's name; trajectory of the body's origin at the first
         epoch, the pings and the last epoch; innovations of every ping and every tenth IMU
-        sample, whitened, see `rovgraph.lab.thesis.run`
+        sample, whitened
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""From a filter, a log and a configuration to what the recursion needs.
+"""Prepares the recursion from a filter, a log and a configuration.
 
-The true motion as a place to linearise at, for studies of what linearisation costs.
+`TrueMotion` is the true motion as the point of linearisation, for studies of the cost of linearisation.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The filters of the thesis by name, and what a study may change in them."""
+"""The filters of the thesis by name, and the numbers in them that a study may change."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal

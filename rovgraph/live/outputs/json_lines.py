@@ -1,10 +1,6 @@
-"""A solution as a line of JSON; docs/online-output.md is the contract.
+"""A solution as a line of JSON, to standard output, to TCP readers, or as UDP datagrams.
 
-JSON lines on standard output.
-
-JSON lines to any number of readers that connect.
-
-JSON lines as datagrams.
+docs/online-output.md is the contract.
 """
 
 import contextlib

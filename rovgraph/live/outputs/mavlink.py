@@ -1,6 +1,4 @@
-"""Solutions to an autopilot over any connection of pymavlink.
-
-Solutions as MAVLink 2 messages.
+"""Solutions as MAVLink 2 messages, to an autopilot over any connection of pymavlink.
 
 Fields: https://mavlink.io/en/messages/common.html, GPS_INPUT (232) and VISION_POSITION_ESTIMATE
 (102). Both take north, east, down and forward, starboard, down, as a solution does.

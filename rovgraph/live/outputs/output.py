@@ -1,8 +1,6 @@
-"""What all outputs have in common.
+"""The base of all outputs: their URLs, their protocol, and a thread for blocking calls.
 
-URLs of outputs: ``scheme:place?option=value``.
-
-A thread that does what may block, and a short queue in front of it.
+A URL is ``scheme:place?option=value``. `Background` is the thread, with a short queue in front of it.
 """
 
 import math

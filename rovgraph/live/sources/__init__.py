@@ -1,12 +1,8 @@
-"""Where messages come from.
+"""Sources of messages: from a URL to a link and a decoder.
 
-A source is a link, which yields bytes as they come, and a decoder, which makes messages of
-them and knows nothing of where they came from. `opening` makes sources of URLs;
-docs/online-sources.md is the contract.
-
-The URL of a source, taken apart, and what is wrong with one.
-
-From a URL to a source.
+A link yields bytes as they come; a decoder makes messages of them, whatever the link. May import what `rovgraph.live`
+may. Begin with `source` (`Source`, `Link`, `Decoder`), then `links` and `json_lines`; `open_sources` takes URLs apart
+and reports errors in them. docs/online-sources.md is the contract.
 """
 
 import math

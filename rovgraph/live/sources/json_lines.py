@@ -1,7 +1,7 @@
 """JSON lines with a log's columns as keys: one object per row.
 
-What a configuration says of a log's names and units holds for them too, so that the rows of a
-log, written as JSON lines, say what the log says.
+The configuration's names and units for a log hold for them too, so that the rows of a log, written as JSON lines, give
+the same measurements.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""Links to the outside: TCP, UDP, standard input, serial ports. All end within `STOP_S` or so.
+"""Links: TCP, UDP, standard input, serial ports and files. All end within `STOP_S` or so.
 
-Links to files: as they are, and telemetry logs (.tlog), where a time stands before each message.
+Files are read as they are; in telemetry logs (.tlog) a time precedes each frame.
 """
 
 import contextlib

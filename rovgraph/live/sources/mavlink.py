@@ -1,4 +1,4 @@
-"""MAVLink, live: what an autopilot tells of its sensors; `rovgraph.readers.mavlink` reads the messages."""
+"""MAVLink, live: an autopilot's sensors; `rovgraph.readers.mavlink` reads the messages."""
 
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass

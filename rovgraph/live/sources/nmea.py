@@ -1,7 +1,7 @@
 """NMEA 0183, live: headings, attitudes and fixes; `rovgraph.readers.nmea_sentences` reads the sentences.
 
-Headings become the log's `ahrs_yaw`, which is of a compass: one that is relative to true north is
-turned by the configuration's declination.
+Headings become the log's `ahrs_yaw`, which is a compass's: a heading from true north is turned by the configuration's
+declination.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,6 @@
 """A source of messages: a link that yields bytes, and a decoder that makes messages of them.
 
-Decoders of bytes that work line by line.
-
-One of several kinds of message that say the same.
+`LineDecoder` decodes line by line. `Preferred` chooses one of several kinds of message with the same content.
 """
 
 import math
