@@ -1,7 +1,4 @@
-"""A dive whose truth is known: what ``rovgraph simulate`` does.
-
-A first dive without a log of your own: what ``rovgraph demo`` does.
-"""
+"""Dives with known truth: the work of ``rovgraph simulate`` and ``rovgraph demo``."""
 
 from dataclasses import dataclass
 from functools import cached_property

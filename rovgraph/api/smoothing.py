@@ -1,4 +1,4 @@
-"""The track of a dive: what ``rovgraph smooth`` does."""
+"""The track of a dive: the work of ``rovgraph smooth``."""
 
 import time
 from collections.abc import Mapping, Sequence

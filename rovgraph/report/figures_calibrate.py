@@ -1,6 +1,7 @@
-"""A magnetometer before and after its calibration: the sphere from three sides, and the field's length.
+"""Figures of a calibration: a magnetometer's samples before and after, and noise of sensors at rest.
 
-Noise of sensors at rest: Allan deviations with the slopes that were read, spectra with their lines named.
+The magnetometer is drawn as the sphere from three sides and as the field's length; noise as Allan deviations with the
+fitted slopes, and as spectra with their lines named.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
-"""Figures of a comparison: errors, end points, velocity, misalignment, a row or a panel per estimator.
+"""Figures of comparisons, studies, observability and plans.
 
-Figures of a study of the misalignment: error against time, coverage, and sd by manoeuvre and inertial unit.
-
-What a dive taught, and when; and what it left tied together.
-
-What to drive: the ranking, and the path of the best.
+- Comparison: errors, end points, velocity, misalignment, a row or a panel per estimator.
+- Study of the misalignment: error against time, coverage, and sd by manoeuvre and inertial unit.
+- Observability: the sd of each component against time, and the correlations that remain.
+- Plan: the ranking, and the path of the best manoeuvre.
 """
 
 from collections.abc import Sequence

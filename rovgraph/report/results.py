@@ -1,10 +1,8 @@
 """The files of a results folder other than the figures; docs/results.md describes them.
 
-Files for programs (trajectories, residuals, history) keep the units of the program, with
-a column ``unit`` where rows differ; what a person reads (calibration, summary) is in
-degrees, and says so.
-
-What of a log goes into a results folder, so that the folder tells the dive without its log.
+Files for programs (trajectories, residuals, history) keep the units of the program, with a column ``unit`` where rows
+differ; files for a person (calibration, summary) are in degrees, and state it. The folder includes the part of the log
+that its page needs.
 """
 
 import hashlib

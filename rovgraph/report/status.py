@@ -1,4 +1,4 @@
-"""The online mode's display on a terminal: where the vehicle is, and how its sensors are."""
+"""The online mode's display on a terminal: position, and the state of the sensors."""
 
 from collections.abc import Callable
 from types import TracebackType

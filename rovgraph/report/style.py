@@ -1,4 +1,4 @@
-"""How all figures look: sizes, colours that the colour-blind and a grey print keep apart, time axes."""
+"""The style of all figures: sizes, colours that stay distinct for the colour-blind and in grey print, time axes."""
 
 import contextlib
 from collections.abc import Iterator, Sequence

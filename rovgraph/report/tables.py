@@ -1,7 +1,4 @@
-"""Tables that a command prints.
-
-A table that is wider than its terminal, as several below each other.
-"""
+"""Tables that a command prints; a table wider than its terminal is split into several below each other."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

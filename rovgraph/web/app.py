@@ -1,13 +1,10 @@
 """The addresses of the page: docs/live-page.md lists them.
 
-Where pilots already look: what BlueOS and Cockpit ask of an extension.
+Beside the page there are addresses for BlueOS, Cockpit and Prometheus. BlueOS looks for ``/register_service`` on every
+port, Cockpit for the widgets that ``cockpit_extras`` names. Cockpit's data lake takes ``name=value`` from a WebSocket,
+one value per message. Prometheus reads the newest state as metrics.
 
-BlueOS looks for ``/register_service`` on every port, Cockpit for the widgets that ``cockpit_extras`` names. Cockpit's
-data lake takes ``name=value`` from a WebSocket, one value per message.
-
-The newest state as Prometheus metrics.
-
-From the body of a request to a command, or to one line that says what is wrong with it.
+The body of a request becomes a command, or a refusal of one line.
 """
 
 import asyncio

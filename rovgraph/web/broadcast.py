@@ -1,8 +1,7 @@
-"""News to every page that watches: encoded once, and a page that does not read is dropped.
+"""Sends news to every page: encoded once, and a page that does not read is dropped.
 
-Connections of clients that may be slow, silent or hostile: none is held for longer than its deadline.
-
-uvicorn by itself waits for a request as long as its client likes, and keeps a closed connection until all is read.
+Connections of clients may be slow, silent or hostile: each has a deadline. uvicorn by itself waits for a request
+without limit, and keeps a closed connection until all is read.
 """
 
 import asyncio

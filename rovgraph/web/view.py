@@ -1,6 +1,6 @@
-"""What pages see of a dive: its newest state, its track, its events. Belongs to the server's thread.
+"""The data that pages show of a dive: its newest state, its track, its events. Belongs to the server's thread.
 
-The track so far, in pieces that are encoded once for all pages.
+`LiveTrack` holds the track so far in pieces that are encoded once for all pages.
 """
 
 import json

@@ -1,8 +1,8 @@
 """Outputs of navigation solutions: a name or URL becomes an `Output`. docs/online-output.md describes each.
 
 An output never blocks, and a fault of the receiver never raises an error: solutions that cannot be sent are dropped,
-counted, and reported once per kind and minute. May import what `rovgraph.live` may. Begin with `output` (what all share), then
-`json_lines`.
+counted, and reported once per kind and minute. May import what `rovgraph.live` may. Begin with `output` (what all
+share), then `json_lines`.
 """
 
 from rovgraph.errors import InputError

@@ -1,8 +1,8 @@
 """Proposes a mapping of the columns of any table, by names, ranges and physics (docs/formats.md).
 
 Names propose; ranges and physics decide units and raise doubt. A column whose name is not recognised is marked unsure
-at best, whatever its numbers. Begin with `names` (words of a column's name), then `groups` (columns by sensor and source)
-and `quantities`. May import what `rovgraph.readers` may.
+at best, whatever its numbers. May import what `rovgraph.readers` may. Begin with `names` (the words of a column's
+name), then `groups` (columns by sensor and source) and `quantities`.
 """
 
 from collections.abc import Mapping

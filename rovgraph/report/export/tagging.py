@@ -1,7 +1,7 @@
 """Where the vehicle was at the times of another table: photos, sonar pings, samples.
 
 Between keyframes position is interpolated along a line and attitude along the shortest arc (slerp). Keyframes are a
-fraction of a second apart, so what an acceleration of 0.1 m/s2 bends within 0.2 s is half a millimetre.
+fraction of a second apart; an acceleration of 0.1 m/s2 bends the track by half a millimetre within 0.2 s.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""What an export is made from: a trajectory with its place on Earth, its time and its fixes.
-
-A track as a table of points with everything that a map can show of them.
-"""
+"""The data of an export: a trajectory with its place on Earth, its time and its fixes, as a table of points."""
 
 import json
 from dataclasses import dataclass, replace

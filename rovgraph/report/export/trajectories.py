@@ -1,10 +1,12 @@
-"""TUM, for `evo_ape` and others: ``time x y z qx qy qz qw``, north, east, down.
+"""Trajectories for other programs: TUM, KITTI, SBET and NetCDF.
+
+TUM, for `evo_ape` and others: ``time x y z qx qy qz qw``, north, east, down.
 
 KITTI odometry poses, for `evo` and others: the first three rows of each pose's matrix, without time.
 
 SBET (Applanix), for survey software: binary records of 17 doubles, and the errors beside it as SMRMSG.
 
-NetCDF with the CF conventions for trajectories: everything that is known, with units and sds.
+NetCDF with the CF conventions for trajectories: all values, with units and sds.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Calibration: each variable against its prior, what is confused with what, what would help, and the biases."""
+"""Section on the calibration: each variable against its prior, confounded variables, remedies, and the biases."""
 
 from collections.abc import Sequence
 

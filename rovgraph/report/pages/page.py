@@ -1,8 +1,7 @@
-"""A page: sections to one HTML file, with everything in it.
+"""A page: sections of panels, tables and text, rendered to one HTML file with all its data.
 
-What a page is made of: sections of panels, tables and text, with arrays packed for the browser.
-
-Series thinned for display: of every stretch its extremes are kept, so that no peak is lost.
+Arrays are packed for the browser. Series are thinned for display: the extremes of every interval are kept, so that
+peaks stay visible.
 """
 
 import base64

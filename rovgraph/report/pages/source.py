@@ -1,8 +1,7 @@
-"""A results folder, read back.
+"""Reads a results folder for its page, and makes the section on its origin.
 
-What a page was made of: configuration, versions, files with checksums, and the command to make it again.
-
-What pages of results folders share: their end, tables of CSV files, images, and numbers as text.
+That section has configuration, versions, files with checksums, and the command to make the folder again. `table_of`,
+`images`, `piece` and `cell` are shared by all pages: tables of CSV files, images, and numbers as text.
 """
 
 import hashlib

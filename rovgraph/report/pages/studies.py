@@ -1,8 +1,7 @@
-"""Pages of `observe`, `plan`, `calibrate` and `check`; and which page a results folder that is no dive's has.
+"""Pages of `compare`, `study`, `observe`, `plan`, `calibrate` and `check`, and of several dives side by side.
 
-Pages of `compare` and `study`: many dives, and how well each estimator or cell does on them.
-
-Several dives side by side: a table, a map of all, and how fast each lost its way.
+`compare` and `study` show how well each estimator or cell does on many dives. Dives side by side have a table, a map of
+all, and the growth of each one's error.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,6 @@
-"""The verdict in words for a person who knows nothing of filters: how good, what limits it, what to do next time.
+"""Section on the verdict, in plain words: how good the track is, what limits it, and what to do next time.
 
-Sources of variance in groups that a person can do something about.
+Sources of variance are grouped by what a person can change.
 """
 
 from collections.abc import Mapping
