@@ -21,11 +21,11 @@ PRESETS = {"mag": "imu", "ahrs": "imu", "dvl_heading": "dvl"}  # section of the 
 
 
 def unchecked_compass(config: Config, sources: Collection[str], present: Collection[str]) -> list[str]:
-    """Calibration variables of the compass that the heading rests on, if nobody calibrated it and nothing checks it.
+    """Calibration variables of the compass that the heading rests on, if it is neither calibrated nor checked.
 
     A calibration is an sd or a mean that is stated of one of them, an offset that is taken as exact, ``imu.mag``, or a
     preset of its instrument. It is checked by another compass, by position fixes, and by a stated heading at the start
-    that is known better. Fixes may still come online, but so far there are none.
+    that is known better. Fixes may still come online.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def unchecked_compass(config: Config, sources: Collection[str], present: Collect
 
 
 def _is_stated(config: Config, name: str) -> bool:
-    """Whether the configuration says what is known of a calibration variable."""
+    """Whether the configuration states a prior for a calibration variable."""
     variable, entry = TABLE[name], getattr(config.calibration, name)
     tail = "_deg" if variable.angular else ""
     known = getattr(entry, "sd" + tail) is not None or getattr(entry, "mean" + tail) is not None

@@ -42,7 +42,7 @@ class AttitudeGap:
 
 
 def without_attitude_gaps(log: Log, config: Config) -> tuple[Log, list[AttitudeGap]]:
-    """A log without what a dive without an IMU cannot use while it does not know its attitude, and those times.
+    """A log without the measurements in attitude gaps that a dive without an IMU cannot use, and the gaps.
 
     A log whose motion an IMU carries comes back as it is.
 

@@ -318,7 +318,7 @@ class MotionRows:
 
     @staticmethod
     def of_states(A_i: Array, A_j: Array, r: Array) -> "MotionRows":
-        """Rows of motions in which nothing walks and that know nothing of the border.
+        """Rows of motions without random walks and without columns of the border.
 
         Parameters
         ----------
@@ -339,7 +339,7 @@ def eliminate(
     ----------
     motions, measurements : the rows of n keyframes
     border_rows : ndarray, shape (p, c + 1), priors of the border with their right-hand sides
-    stops : increasing, keyframes at which to keep what the rows up to there say (`SquareRoot.filtered`)
+    stops : increasing, keyframes at which to keep the information of the rows so far (`SquareRoot.filtered`)
 
     Raises
     ------

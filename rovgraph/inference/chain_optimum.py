@@ -62,7 +62,7 @@ class ChainWindow:
 
 
 def window(chain: Chain, solution: GaussNewtonResult[State], begin: float, end: float) -> ChainWindow | None:
-    """The keyframes between two times; None = they are half of the dive, or there are measurements no kernel knows.
+    """The keyframes between two times; None = they are half of the dive, or a sensor has no kernel.
 
     Parameters
     ----------

@@ -121,7 +121,7 @@ WORTH_A_LOOK = {
     "fix": 1.0,
     "depth": 0.4,  # healthy ones have at most 0.2, those with 3 cm of error that lasts 0.7
 }  # least `unity`; the track takes a DVL's error along
-CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
+CLEAR = 8.0  # gain beyond chance: of healthy dives one in a hundred reaches 6
 PART_OF_BEST = 0.25  # of the best explanation's gain, that a rival has: wrong ones had 0.46 of the right one's and more
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
 SMALLEST = 0.01  # sd, in that of the table
@@ -247,9 +247,9 @@ class _Baseline:
         return self._solved(wider, begin_at(wider, self.solution.point), self.solution)
 
     def reopened(self, chain: Chain, begin: State) -> "_Baseline":
-        """The dive as another chain from a point, all measurements let in to begin with.
+        """The dive as another chain from a point, all measurements admitted to begin with.
 
-        Without an error that is there the estimate may have bent away from good ones, which no gate lets in again.
+        Without the error the estimate may have moved away from good ones, which their gate then rejects for good.
         """
         return self._solved(chain, begin, replace(self.solution, gates=chain.initial_gates(), stretches=()))
 
@@ -298,8 +298,8 @@ def _steps(now: _Baseline, passed: Collection[str], beside: str = "") -> list[Ga
 def _jumps(block: Measurements, state: State, H: Array) -> tuple[tuple[float, Array], ...]:
     """When the residuals of a sensor jump, and by how much as an error; in the order of time.
 
-    Each measurement by itself says how large the error is. Medians of some seconds are compared with those after the
-    next: over so short a time the IMU knows the motion, however the estimate has bent to follow the sensor.
+    Each measurement by itself gives the error. Medians of some seconds are compared with those after the
+    next: over so short a time the IMU determines the motion, however far the estimate followed the sensor.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ def _with_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovErr
 def _fit_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovError, _Baseline]:
     """Steps with what they take off the cost, less their chances, and the dive with them.
 
-    Costs compare where other measurements are taken out, which determinants do not.
+    Costs compare where other measurements are excluded, which determinants do not.
     """
     stepped = now.with_steps(error.variable, error.sd, error.steps)
     path, time = stepped.solution.point.calibration[error.variable], now.chain.problem.time
@@ -372,9 +372,9 @@ def _fit_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovErro
 
 
 def _reopened(now: _Baseline, passed: Collection[str]) -> list[tuple[GaussMarkovError, _Baseline]]:
-    """Errors of the table's size, each with all measurements let in to begin with, and the dives with them.
+    """Errors of the table's size, each with all measurements admitted to begin with, and the dives with them.
 
-    Costs compare where other measurements are let in, and what an error's freedom costs where they are the same.
+    Costs compare where other measurements are admitted; the likelihood, with an error's freedom, where they are the same.
     """
     out, chain = [], now.chain
     plain = now.reopened(chain, now.solution.point)
@@ -422,7 +422,7 @@ def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) 
 
     Parameters
     ----------
-    block, state, gate : measurements, their keyframes' states, and which are let in
+    block, state, gate : measurements, their keyframes' states, and which are admitted
     H : ndarray, shape (n, dim, k), whitened Jacobian by what the residuals are looked at as
     """
     r = block.normalised(state)
@@ -430,7 +430,7 @@ def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) 
     score, information = np.einsum("nij,ni->nj", H, r), np.einsum("nij,nij->nj", H, H) * gate[:, None]
     window = ((block.time - block.time[0]) // WINDOW_S).astype(np.int64)
     sums = np.array([[np.bincount(window, column) for column in part.T] for part in (score, information)])
-    windows = sums[:, sums[1] > 0.0]  # windows without measurements that are let in say nothing
+    windows = sums[:, sums[1] > 0.0]  # windows without admitted measurements give no value
     if not windows.size:
         return 1.0
     return float(np.mean(windows[0] ** 2 / np.maximum(windows[1], 0.1 * np.median(windows[1]))))
@@ -498,7 +498,7 @@ def _as_constant(
 def _most_likely(now: _Baseline, begin: GaussMarkovError) -> GaussMarkovError:
     """The error of a sensor that makes the linear dive the most likely, or one that is implausible and more likely.
 
-    What the data tell best is how an error walks over short times, so that and the time constant are searched for: of
+    The data determine best how an error walks over short times, so that and the time constant are searched for: of
     sd and time constant the likelihood has a long ridge.
     """
     from scipy.optimize import minimize  # takes 0.1 s to load; healthy dives do not need it

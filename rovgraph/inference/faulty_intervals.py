@@ -49,9 +49,9 @@ from rovgraph.inference.gauss_newton import (
 from rovgraph.rules import CHANCE, USUAL_SHARE
 
 BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and as many measurements
-SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
-AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with
-NOTICEABLE, CLEAR = 12.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
+SAME_CAUSE_S = 20.0  # bursts at most so far apart have one cause
+AROUND_S = (5.0, 20.0, 60.0)  # around a burst, excluded to begin with
+NOTICEABLE, CLEAR = 12.0, 100.0  # gain that may be chance; gain that is not chance
 OUTWARDS = (0, 2, 8, 16, 32, 64)  # measurements from what is clear
 SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
 GROWING = 5  # times what is beyond that, a slow error was there before it showed
@@ -137,7 +137,7 @@ def solve(
     Parameters
     ----------
     problem, point : the dive, and where to begin
-    freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
+    freed : the dive, from where it is linearised, with the uncertain constants that ``problem`` holds estimated: an
         error that a mounting explains is no stretch's
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
     searches : that were made for other solutions of the same dive, as configured the same
@@ -223,7 +223,7 @@ def _without_stretch_in(
 def resume(
     problem: Linearizable[Point, Step], point: Point, known: GaussNewtonResult[Point], tolerance: float | None = None
 ) -> GaussNewtonResult[Point]:
-    """The optimum of a problem close to one whose solution is known, with the same stretches taken out."""
+    """The optimum of a problem close to one whose solution is known, with the same intervals excluded."""
     barred = _barred(problem.measured(), known.stretches)
     return _with_stretches(problem, minimise(problem, point, known.gates, barred, tolerance), known)
 
@@ -287,7 +287,7 @@ def _joined(windows: Sequence[tuple[float, float, float]]) -> list[tuple[float, 
 def _taken_out_around(
     problem: Linearizable[Point, Step], best: GaussNewtonResult[Point], burst: FaultyInterval, sensor: str
 ) -> GaussNewtonResult[Point] | None:
-    """The cheapest optimum without a sensor's measurements around a burst; None = there is none."""
+    """The cheapest optimum without a sensor's measurements around a burst; None = no such optimum."""
     wider = [FaultyInterval(sensor, burst.begin - more, burst.end + more) for more in AROUND_S]
     found = [_solved_without(problem, best, (*best.stretches, stretch)) for stretch in wider]
     return min(filter(None, found), key=lambda one: one.cost, default=None)

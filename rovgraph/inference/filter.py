@@ -309,7 +309,7 @@ class FilterEngine:
         problem : the dive
         before : the keyframe before, or at the first `start`
         gates : renewed in place
-        wholly : tell the way to the keyframe, too
+        wholly : return the transition to the keyframe, too
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
         here, met = self._first_here(problem, k), Met.of(problem, k, len(before.c))
@@ -326,7 +326,7 @@ class FilterEngine:
         return FilterStep(filtered, met, departed, transition)
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
-        """Whether kernels know all of the interval that ends with keyframe k."""
+        """Whether kernels can take the whole interval that ends with keyframe k."""
         if k == 0 or before.places or poorly_known(before) or self._changes(problem, k):
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
@@ -375,7 +375,7 @@ class FilterEngine:
         return end - int(np.count_nonzero(problem.keyframe[begin:end] == k))
 
     def run(self, problem: Problem, begin: int, end: int, before: Gaussian, gates: FilterGates) -> FilterRun:
-        """Take intervals of a dive as `step` does, as far as kernels know how.
+        """Take intervals of a dive as `step` does, as far as kernels can.
 
         Parameters
         ----------
@@ -412,7 +412,7 @@ class FilterEngine:
     ) -> Gaussian:
         """The estimate corrected by measurements of its keyframe, places last; without gates all count.
 
-        ``met`` is told how they were met.
+        ``met`` receives how they were processed.
         """
         index = np.arange(some.start, some.stop)
         seen = problem.number[some] >= 0
@@ -447,11 +447,11 @@ class FilterEngine:
         return np.asarray(np.sum(by_considered**2, axis=1) / (np.sum(own @ P * own, axis=1) + 1.0))
 
     def knows(self, sensor: str) -> bool:
-        """Whether the kernels know a sensor's equation."""
+        """Whether the kernels have a sensor's equation."""
         return sensor not in self._given
 
     def rows(self, problem: Problem, index: Index) -> KeyframeRows:
-        """Measurements of one keyframe that the kernels know."""
+        """Measurements of one keyframe whose equations the kernels have."""
         layout, measured = self.layout, problem.measured(index)
         return KeyframeRows(measured, self._model.sensors, layout.column, layout.width, self._gravity)
 
@@ -535,7 +535,7 @@ class FilterEngine:
         gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
 
     def _of_model(self, known: Gaussian, problem: Problem, row: int) -> tuple[Array, Array]:
-        """The same of a sensor whose equation the kernels do not know."""
+        """The same of a sensor without a kernel."""
         state = known.state if problem.number[row] < 0 else known.state.seeing(ORIGIN)
         r, jacobians = self.measurements(problem, np.array([row])).linearize(state)
         return r[0], self.layout.matrix(jacobians)[0]

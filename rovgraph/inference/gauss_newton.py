@@ -48,7 +48,7 @@ class GatedMeasurements:
     ----------
     time : ndarray, shape (n,) [s]
     dim : components of each
-    cost_at_gate : robust cost of one at its gate, infinite where there is none
+    cost_at_gate : robust cost of one at its gate, infinite without a gate
     """
 
     time: Array
@@ -64,7 +64,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def initial_gates(self) -> Gates:
-        """Which measurements are let in to begin with."""
+        """Which measurements are admitted to begin with."""
         ...
 
     def gates(self, point: Point) -> Gates:
@@ -72,7 +72,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def cost(self, point: Point, gates: Gates) -> float:
-        """The robust cost of what is let in, with that of priors and motions."""
+        """The robust cost of admitted measurements, priors and motions."""
         ...
 
     def step(self, point: Point, gates: Gates) -> Step:
@@ -109,11 +109,11 @@ class GaussNewtonResult(Generic[Point]):
     Attributes
     ----------
     point : where it lies
-    gates : sensor -> which measurements were let in
-    cost : robust cost, with that of the measurements that were not let in
+    gates : sensor -> which measurements were admitted
+    cost : robust cost, with that of the rejected measurements
     iterations : Gauss-Newton steps in all
     converged : the last cost no longer fell
-    stretches : taken out as a whole, of `rovgraph.inference.faulty_intervals`
+    stretches : intervals excluded as a whole, of `rovgraph.inference.faulty_intervals`
     runner_up : how much more the next best of the optima costs that were compared, infinite where there was one
     """
 

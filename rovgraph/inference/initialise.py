@@ -146,7 +146,7 @@ HEADINGS = 50  # samples of a source that are looked at
 UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
 FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
 AGREE_SD = 3.0  # of a fix with the line through those around it
-MOST_MPS = 1.0  # that a vehicle moves before anything says where it is
+MOST_MPS = 1.0  # speed of a vehicle before its first position
 
 
 class Level(NamedTuple):
@@ -171,7 +171,7 @@ class Level(NamedTuple):
 
 
 def level(log: Log, config: Config) -> Level:
-    """What the IMU says of the first seconds.
+    """The first seconds by the IMU.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def level(log: Log, config: Config) -> Level:
 
 
 def _moves(log: Log) -> bool:
-    """Whether DVL or compass say so: a steady turn is as quiet as standing still."""
+    """Whether DVL or compass show motion: a steady turn is as quiet as standing still."""
     if "dvl" in log:
         ping = _opening(log["dvl"], log["imu"].time[0], WINDOW_S)
         speed = np.linalg.norm(ping.data[ping["dvl_valid"] == 1.0, :3], axis=1)
@@ -222,7 +222,7 @@ def first_heading(
 ) -> tuple[float, str]:
     """Yaw of the first epoch [rad], and the source that shows it.
 
-    Of what a source says in its first seconds, each sample brought back to the first epoch by the gyro, the
+    Of a source's samples in its first seconds, each brought back to the first epoch by the gyro, the
     one that the others are nearest to: the median on a circle.
 
     Parameters
@@ -235,7 +235,7 @@ def first_heading(
 
     Raises
     ------
-    InputError : no source speaks early enough
+    InputError : no source measures early enough
     """
     begin, means = log["imu"].time[0], {name: b.mean for name, b in beliefs(config).items()}
     for source in by_accuracy(config, sources):
@@ -366,7 +366,7 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
 def _on_a_bed_that_may_move(log: Log, config: Config, assumptions: list[str]) -> Config:
     """A vehicle with neither IMU nor depth is a boat, and rivers move their beds: they are surveyed for that.
 
-    Nothing but position fixes would show it, so it is estimated unless the configuration says otherwise.
+    Only position fixes would show it, so it is estimated unless the configuration states otherwise.
     """
     if "depth" in log or "dvl" not in log or getattr(config.calibration, BOTTOM).estimate != AUTO:
         return config
@@ -413,7 +413,7 @@ def first_tilt(log: Log) -> tuple[float, float]:
 
 
 def no_bias() -> tuple[Array, Array]:
-    """Bias of the first keyframe and its sd, shapes (6,): there is none."""
+    """Bias of the first keyframe and its sd without an IMU: zeros, shapes (6,)."""
     return np.zeros(6), np.full(6, NO_BIAS_SD)
 
 

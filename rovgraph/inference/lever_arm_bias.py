@@ -27,7 +27,7 @@ MOST_DRAWN = 5.0  # sds, up to which it may be estimated: what is taken off is r
 MOST_DRAWN_UNCORRECTED = 1.0  # the same where nothing is taken off
 ROUNDS = 3  # each leaves of the score's error the share of spurious information
 MOST_FOLLOWED = 0.2  # part of a ping's information that goes into its own prediction
-BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: that is no noise of a gyro
+BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: not the noise of a gyro
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class SpuriousInformation:
 
 
 def spurious_information(best: Optimum) -> SpuriousInformation:
-    """That of the arm in a dive, F and F l of above; of the measurements that are let in, with their weights."""
+    """F and F l of above in a dive, of the admitted measurements with their weights."""
     information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
     for sensor, block in best.blocks.items():
         model = block.instrument.model
@@ -95,7 +95,7 @@ def _followed(best: Optimum) -> Array:
 
 
 def noise_moves_arm(best: Optimum, sd: Array) -> bool:
-    """Whether too much of what least squares knows of the arm is spurious, of an sd of shape (3,) [m]."""
+    """Whether too much of least squares' information about the arm is spurious, of an sd of shape (3,) [m]."""
     spurious = spurious_information(best)
     most = MOST_DRAWN if isinstance(best, ChainOptimum) else MOST_DRAWN_UNCORRECTED
     return bool(((spurious.share(sd) > MOST) | (spurious.drawn(sd) > most * sd)).any())

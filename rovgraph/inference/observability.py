@@ -22,7 +22,7 @@ from rovgraph.problem.calibration_roles import CalibrationRoles
 
 # sd after the dive over sd before. Below 0.3 more than nine tenths of the variance are gone and
 # the data outweigh the prior ten to one, so a wrong prior does no harm. Above 0.8 the data have less
-# than 0.6 of the prior's weight: what they say is mostly the prior repeated, and no estimate to act upon.
+# than 0.6 of the prior's weight: such values mostly repeat the prior, and are no basis for action.
 OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE = 0.3, 0.8
 OBSERVABLE, WEAK, UNOBSERVABLE = "observable", "weak", "unobservable"
 SPURIOUSLY_OBSERVABLE = (
@@ -61,7 +61,7 @@ def relative_covariance(information: Array) -> Array:
 
 
 def without_spurious_information(best: Optimum, keyframes: Sequence[int], information: Array, sd: Array) -> Array:
-    """Information without what noise in the estimate pretends.
+    """Information without the spurious part from noise in the estimate.
 
     Parameters
     ----------
@@ -125,8 +125,8 @@ def shown(best: Optimum) -> list[str]:
 
 
 def shown_below(best: Optimum, name: str) -> float:
-    """The sd of a constant, as a part of the prior's, below which a dive shows it: less where noise may feign it."""
-    if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not feign
+    """The sd of a constant, as a part of the prior's, below which a dive shows it: less where noise may cause spurious information."""
+    if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not make spurious
         return OBSERVABLE_BELOW
     return DOUBTFUL_ABOVE if name in SPURIOUSLY_OBSERVABLE else OBSERVABLE_BELOW
 

@@ -41,7 +41,7 @@ def rows(size: int, index: int) -> slice:
 
 
 def columns(size: int, chosen: Sequence[int]) -> Array:
-    """Components of all that is no place, and of some places."""
+    """Components of the state without its places, and of some places."""
     return np.concatenate([np.arange(size), *(np.r_[rows(size, k)] for k in chosen)])
 
 
@@ -64,7 +64,7 @@ def moved(places: Sequence[RememberedPlace], delta: Array) -> tuple[RememberedPl
 
 
 def common(some: Sequence[RememberedPlace], others: Sequence[RememberedPlace]) -> tuple[list[int], list[int], Array]:
-    """Places that two estimates both know.
+    """Places in both of two estimates.
 
     Returns
     -------
@@ -102,7 +102,7 @@ class Match:
 def nearest(
     P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[RememberedPlace], name: float
 ) -> Match | None:
-    """The place of a name that a landmark fits best; None where there is none.
+    """The place of a name that a landmark fits best; None if it fits no place.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class ScoreTest:
 def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
     """A dive as `score_test` takes it: itself, or where places were seen, its chain without them about the same point.
 
-    The step of a constant is then what all other measurements say of it.
+    The step of a constant is then determined by all other measurements.
     """
     if isinstance(best, ChainOptimum):
         return best

@@ -76,7 +76,7 @@ def optimum(
 def _contradicted(best: ChainOptimum) -> bool:
     """Whether many measurements of a sensor are rejected, as those of a DVL whose mounting is held where it is not.
 
-    A stretch that was taken out is an explanation of its own.
+    An excluded interval is an explanation of its own.
     """
     return not best.solution.stretches and rejects(best.solution.gates, CONTRADICTED)
 
@@ -126,7 +126,7 @@ class BatchSmoother:
     problem : the same as arrays
     left_out : (sensor, reason) -> count of measurements that never reach it
     time_offsets : how late stamps are
-    searches : for stretches of wrong measurements, shared with whoever solves the same dive
+    searches : for faulty intervals, shared by all that solve the same dive
     """
 
     initial: InitialConditions

@@ -46,7 +46,7 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
     space of as many elements as W has rows and columns.
     """
     if pivot < 0 or first < 0 or column < 0:
-        return  # it never is; the compiler must know it to use vector instructions
+        return  # never true; lets the compiler use vector instructions
     count = last - first
     square, other = 0.0, 0.0
     for i in range(count):
@@ -133,7 +133,7 @@ class Elimination(NamedTuple):
 
     Attributes
     ----------
-    stops : shape (f,), increasing, keyframes at which to keep what the rows up to there say
+    stops : shape (f,), increasing, keyframes at which to keep the information of the rows so far
     conditionals : shape (n, d, 2 d + c + 1), columns R_k, S_k, T_k, z_k
     border : shape (c, c + 1), columns R_y, z_y
     filtered : shape (f, d + c, d + c + 1), triangular: rows of that keyframe and of the border, of data up to it

@@ -247,10 +247,10 @@ def leave_out(found: Innovations, j: int) -> None:
 
 @helper
 def inflate(P: Array, found: Innovations, measurement: int, seen: Array, spread: Array) -> None:
-    """Let something that no model knows have moved what a sensor sees, by as much as its measurement shows.
+    """Inflate the covariance of what a sensor measures, as if moved by something that no model has.
 
     As a knock does to velocity and position: P += |x|^2 (seen seen' + spread spread'), x the least squares solution
-    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor sees, with what has
+    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor measures, with what has
     followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
     """
     n, s = seen.shape
@@ -401,11 +401,11 @@ def determinant(A: Array) -> float:
 
 @helper
 def coordinates_of_velocity(x: Array, P: Array, layout: ErrorColumns) -> ErrorColumns:
-    """The layout in which velocity moves along those axes, n's or the body's, along which it is known more sharply.
+    """The layout in which velocity moves along the axes, n's or the body's, along which it is known better.
 
-    A DVL knows it along the body's, where a correction of heading must not touch what it has seen. In its silence
-    depth alone knows velocity, along n: moved as the DVL sees it, a correction of tilt by 0.3 degrees would make
-    15 mm/s downwards of a velocity that is 3 m/s off, which depth takes for knowledge of all of the velocity.
+    A DVL measures it along the body's, where a correction of heading must not change it. In an outage of the DVL
+    only depth measures velocity, along n: moved along the body's axes, a correction of tilt by 0.3 degrees would make
+    15 mm/s downwards of a velocity that is 3 m/s off, and depth would seem to determine all of the velocity.
     The measure is the volume of the error's ellipsoid: that of v_n against that of R' v_n, whose error along n is
     d_v + v_n x R d_R.
     """

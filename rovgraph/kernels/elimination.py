@@ -112,7 +112,7 @@ def eliminate_dive(
 
     Parameters
     ----------
-    entered : shape (m,), measurements that are let in
+    entered : shape (m,), admitted measurements
     column : shape (15 + C,), target of each component of state and calibration, -1 where it is not estimated
     given : rows that no kernel computes
     border_rows : as in `eliminate`
@@ -172,7 +172,7 @@ def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> Non
 
 @kernel()
 def robust_costs(square: Vector, which: Index, sensors: Matrix, entered: Flags) -> float:
-    """Sum of the robust costs of measurements of some squared lengths, of those that are let in."""
+    """Sum of the robust costs of the admitted measurements, from their squared lengths."""
     total = 0.0
     for m in range(len(square)):
         if entered[m]:

@@ -161,7 +161,7 @@ def attitude_variances_of(x: AnyVector, P: AnyMatrix) -> tuple[float, float]:
 
 @helper
 def knows_all(which: Index, sensors: Array) -> bool:
-    """Whether kernels know the equations of all measurements."""
+    """Whether kernels have the equations of all measurements."""
     given = 0
     for j in range(len(which)):
         given += sensors[which[j], KIND] == GIVEN
@@ -201,7 +201,7 @@ class Interval(NamedTuple):
 
     Attributes
     ----------
-    motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
+    motion : row of `rovgraph.kernels.motion_row`, or (0,) if all measurements are at one keyframe
     covariance : of the motion's residual, shape (15, 15)
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     measured : its measurements

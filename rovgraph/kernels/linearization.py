@@ -338,7 +338,7 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
     row, sensor = one.row, one.sensor
     kind, dim = int(sensor[KIND]), int(sensor[DIM])
     z, H, W = scratch.z[:dim], scratch.H[:dim], scratch.W[:dim, :dim]
-    for a in range(dim):  # columns that are not estimated nobody reads
+    for a in range(dim):  # columns that are not estimated are not read
         for j in range(MOTION):
             H[a, j] = 0.0
         for j in scratch.used:
@@ -461,7 +461,7 @@ def place_measurements(
     rate_out: Matrix,
     F_out: Matrices,
 ) -> None:
-    """States at the own times of m measurements, for models that no kernel knows; with derivatives.
+    """States at the own times of m measurements, for models without a kernel; with derivatives.
 
     Parameters
     ----------

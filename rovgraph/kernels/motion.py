@@ -452,7 +452,7 @@ def predict_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionS
 
 @view_helper
 def _add_turning(row: Array, R: Array, scratch: MotionScratch) -> None:
-    """What a turning Earth adds to the derivatives: v + S(w) p is what goes on."""
+    """Terms of a turning Earth in the derivatives, for v + S(w) p in place of v."""
     t, rate, J = row[DURATION], scratch.vectors[0], scratch.J
     spin, spun, turned = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3]
     skew(rate, spin)
@@ -480,7 +480,7 @@ def predict_with_transition(
 ) -> None:
     """The state at the end of one interval; its error's transition and process noise, shape (15, 15).
 
-    The residual's derivatives by both states say A_i e_i + A_j e_j = noise of covariance S. Where the state after
+    The residual's derivatives by both states give A_i e_i + A_j e_j = noise of covariance S. Where the state after
     is the predicted one, A_j is -1 on the diagonal but for velocity, -R_j', so that e_j = F e_i + w with F and
     Q = cov w without an inverse.
     """

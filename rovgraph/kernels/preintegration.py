@@ -328,7 +328,7 @@ def first_not_before(imu: Array, time: float) -> int:
 def fit_rate(imu: Array, time: float, rate_out: Array) -> tuple[float, float]:
     """Rate at a time, of a parabola through the samples within `HALF_WINDOW_S` of it, if they are enough.
 
-    Through fewer a parabola says too little; then it is interpolated between the two around it. The lever arm turns
+    With fewer samples a parabola is too uncertain; then the rate is interpolated. The lever arm turns
     the noise of the rate into velocity, and the derivative by the misalignment into knowledge that is not there, so a
     single sample would not do.
 

@@ -113,7 +113,7 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
 
     Raises
     ------
-    InputError : a column or unit that is unknown, a cell that is no number, no time
+    InputError : a column or unit that is unknown, a cell that is not a number, no time
 
     Warns
     -----
@@ -341,7 +341,7 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
 
 
 def _known_sd(column: Column, sd: Array, line: Lines, source: str) -> None:
-    """An sd of 0, -1, 9999 and the like, as many instruments write it that do not know, becomes NaN.
+    """An sd of 0, -1, 9999 and the like, which many instruments write without an estimate, becomes NaN.
 
     Placeholders among better sds stay: such a measurement is worth little.
     """

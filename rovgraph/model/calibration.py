@@ -45,8 +45,8 @@ class Variable:
         says otherwise
     time_constant : default time constant of an error that lasts, first-order Gauss-Markov with the prior's sd [s];
         infinite = no such error
-    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, which nobody
-        calibrated and nothing checks [unit]; None = there is no such case
+    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, without a stated
+        calibration or a second sensor [unit]; None = not for this variable
     """
 
     name: str
@@ -474,7 +474,7 @@ def unregister(name: str) -> None:
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of a calibration variable before the data speak.
+    """Prior of a calibration variable.
 
     Attributes
     ----------

@@ -420,7 +420,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     Parameters
     ----------
     config : as stated
-    unchecked : calibration variables of a compass that nobody calibrated and nothing checks
+    unchecked : calibration variables of a compass without stated calibration that no sensor checks
     names : calibration variables that are stated; None = all
     """
     given, entries = config.calibration, {}
@@ -508,7 +508,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
         data = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError) as error:  # ValueError: a date or a number that is none
+    except (YAMLError, ValueError) as error:  # ValueError: an invalid date or number
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = str(getattr(error, "problem", None) or error or "cannot be parsed").splitlines()[0]
@@ -521,7 +521,7 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
-    """What keys and values say, by a model that knows all of its keys; ``source`` names them in messages.
+    """Keys and values as an instance of a model; ``source`` names them in messages.
 
     Raises
     ------
@@ -530,7 +530,7 @@ def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
     try:
         return model.model_validate(_without_empty(model, data))
     except ValidationError as error:
-        said = dict.fromkeys(complaint(e, model) for e in error.errors())  # each item that a list lacks says the same
+        said = dict.fromkeys(complaint(e, model) for e in error.errors())  # once for all items of a list
         raise InputError(f"{source}: " + "; ".join(said)) from None
 
 

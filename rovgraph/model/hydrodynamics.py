@@ -133,7 +133,7 @@ class Hydrodynamics:
     ) -> tuple[Array, Jacobians]:
         """Derivative of the components of velocity in body axes (2.18), drag included.
 
-        The acceleration felt in n is R_nb (result + w x velocity), and that of the water.
+        The acceleration in n is R_nb (result + w x velocity), and that of the water.
 
         Parameters
         ----------

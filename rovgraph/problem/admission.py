@@ -58,7 +58,7 @@ OLDEST_SIGNAL_S = 1.0  # a thruster's signal is believed to last that long
 def thruster_pieces(
     model: ModelAiding, signals: Sequence[Measurement], begin: float, end: float, samples: Array
 ) -> Iterator[Measurement | str]:
-    """What thrusters tell between two keyframes, each at the middle of its piece, or why a piece tells nothing.
+    """Thruster measurements between two keyframes, each at the middle of its piece, or why a piece has none.
 
     Parameters
     ----------

@@ -79,7 +79,7 @@ class Assembly:
     bias : ndarray, shape (6,), for preintegration
     believed : priors of the calibration; None = the configuration's
     assumed : how late stamps are; None = as these have it
-    learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
+    learn_noise : raise the IMU's noise to what its newest samples show, where the whole log is not yet available
     """
 
     config: Config
@@ -113,7 +113,7 @@ class Assembly:
         self._periods: list[float] = []
         self._gaps: list[float] = []  # times of samples after gaps, since the newest keyframe
         self._left_out: Counter[tuple[str, str]] = Counter()  # what has been forgotten
-        self._no_pieces: list[tuple[int, str]] = []  # keyframe, and why a piece before it tells nothing
+        self._no_pieces: list[tuple[int, str]] = []  # keyframe, and why a piece before it has no measurement
         self._order = np.empty(BUFFER, np.int64)
         self._dive = self._room(BUFFER, BUFFER, BUFFER)
         self._ahead = self._room(2, 0, 0)
@@ -191,7 +191,7 @@ class Assembly:
                 return InsertResult.AGAIN
             if self._closes(m.sensor):
                 self._due = min(self._due, m.time - self.time_offsets.of_sensor(m.sensor))
-        if self._no_imu:  # time goes on to it
+        if self._no_imu:  # its time advances to it
             self._insert_sample(m.time, np.zeros(6), m.row)
         return InsertResult.IN
 
@@ -573,7 +573,7 @@ class Assembly:
         return self._no_imu or sensor == "dvl"
 
     def _about(self, sensor: str) -> list[int]:
-        """What kernels need to know of a sensor."""
+        """Parameters of a sensor for the kernels."""
         late = [s for s in self.names if self.time_offsets.lag(s) is not None]
         # the rate reaches these: by a lever arm, or by the motion of a turning body
         turned = self.instruments[sensor].rate_gain.any() or sensor == "thruster"
@@ -661,7 +661,7 @@ class Assembly:
             self.truncate(n)
 
     def _take_period(self, period: float) -> None:
-        """Learn from the first samples what a gap is."""
+        """Find the regular sample interval, beyond which there is a gap, from the first samples."""
         if len(self._periods) < at.PERIODS and not self._no_imu:
             self._periods.append(period)
             self._steps[len(self._periods) :] = GAP_PERIODS * float(np.median(self._periods))
@@ -703,7 +703,7 @@ class Assembly:
         return events
 
     def _pieces(self, begin: int) -> Array:
-        """What thrusters tell of the intervals that end with keyframes from ``begin`` on, as events."""
+        """Thruster measurements of the intervals that end with keyframes from ``begin`` on, as events."""
         model = cast(ModelAiding, self.instruments["thruster"].model)
         table, gone, out = self._table, int(self._dive.counts[at.FORGOTTEN]), [self._listed[:0]]
         for k in range(begin, len(self)):

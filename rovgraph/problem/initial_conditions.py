@@ -44,7 +44,7 @@ class StatePrior:
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What a dive has revealed of its instruments, in place of what the configuration says.
+    """Noise and constants found in a dive, in place of the configuration's.
 
     Attributes
     ----------

@@ -46,7 +46,7 @@ def has_constant_velocity(config: Config) -> bool:
 
 
 def gravity(config: Config) -> float:
-    """Gravity that the motion is integrated with, none where no accelerometer feels it [m/s^2]."""
+    """Gravity that the motion is integrated with, 0 without an accelerometer [m/s^2]."""
     return 0.0 if has_constant_velocity(config) else config.environment.gravity_mps2
 
 

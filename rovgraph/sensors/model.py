@@ -26,7 +26,7 @@ from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobia
 
 
 class SensorModel(Protocol):
-    """What estimators, simulator and studies know of a sensor.
+    """Measurement model of a sensor, for estimators, simulator and studies.
 
     Attributes
     ----------

@@ -79,7 +79,7 @@ def priors(prior: StatePrior, beliefs: Mapping[str, Belief], unknowns: Calibrati
 
 
 def landmark_prior(number: int) -> Factor:
-    """The prior of a place: it says next to nothing, and determines a place that all gates have shut out."""
+    """The prior of a place: so wide that it only determines a place all of whose sightings are rejected."""
     return gtsam.PriorFactorVector(
         key(PLACE, number), np.zeros(PLACE_DIM), gtsam.noiseModel.Isotropic.Sigma(PLACE_DIM, ANYWHERE_M)
     )
@@ -185,7 +185,7 @@ def preintegrated(motion: Array, steps: Array) -> gtsam.PreintegratedCombinedMea
 
 
 def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Mapping[str, int]) -> gtsam.CustomFactor:
-    """The residual of `rovgraph.kernels.motion_residual` as a factor, which knows the IMU's scales.
+    """The residual of `rovgraph.kernels.motion_residual` as a factor, with the IMU's scales.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class KeyframeTerms:
 
     Parameters
     ----------
-    filter : knows their equations
+    filter : with their equations
     problem, index : the dive, and which of its measurements; at least one
     """
 
@@ -104,11 +104,11 @@ class KeyframeTerms:
 
 
 class IntervalTerms:
-    """An interval with what was let in of its measurements, to be linearised at any point.
+    """An interval with its admitted measurements, which can be linearised at any point.
 
     Parameters
     ----------
-    filter : knows the equations
+    filter : with the equations
     problem, k : the interval that ends with keyframe k
     let_in : ndarray of int, its measurements that count
 
@@ -139,7 +139,7 @@ class Linearization:
 
     Parameters
     ----------
-    filter : knows the layout of the error
+    filter : with the layout of the error
     prior : of the first keyframe
     """
 
@@ -230,7 +230,7 @@ class Incremental:
 
     Parameters
     ----------
-    filter : knows equations, prior and the layout of the error
+    filter : with equations, prior and the layout of the error
     beliefs : of the calibration, all of which walks
 
     Attributes
@@ -372,7 +372,7 @@ class Incremental:
         self._replace(segment)
 
     def restart(self, problem: Problem, let_in: Gates, x: Array, c: Array) -> None:
-        """Go on from another point, and with other measurements.
+        """Continue from another point, and with other measurements.
 
         Parameters
         ----------
@@ -430,7 +430,7 @@ class Incremental:
             self._owners += [index] * len(factors)
 
     def _insert(self, name: int, dim: int) -> None:
-        """A variable that iSAM2 does not know yet; the error is zero at the point."""
+        """A new variable of iSAM2; the error is zero at the point."""
         if not self._engine.valueExists(name):
             self._values.insert(name, np.zeros(dim))
 
@@ -487,7 +487,7 @@ def moved(x: Array, delta: Array) -> Array:
     return out
 
 
-UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
+UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where not every keyframe is needed
 # since the start, when the dive so far is solved with all its measurements: a gate may have been wrong before [s]
 OPTIMUM_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)
 CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
@@ -552,14 +552,14 @@ class IncrementalEstimator:
         return made
 
     def step(self, problem: Problem, k: int) -> FilterStep:
-        """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
+        """Take an interval: predicted and gated from iSAM2's estimate of the keyframe before, then added."""
         done = self.filter.step(problem, k, self.known, self.gates)
         self.take(problem, k, done.filtered, done.met)
         self.history.append(self.known, done.met)
         return done
 
     def take(self, problem: Problem, k: int, known: Gaussian, met: Met) -> None:
-        """Take a keyframe with what of its measurements was let in.
+        """Take a keyframe with its admitted measurements.
 
         Parameters
         ----------
@@ -575,7 +575,7 @@ class IncrementalEstimator:
             self.update()
 
     def update(self) -> None:
-        """Have iSAM2 take what has come since; the filter goes on from its newest keyframe."""
+        """Update iSAM2 with the intervals since; the filter continues from its newest keyframe."""
         if self.updated == self._count - 1:
             return
         self.engine.update()
@@ -601,7 +601,7 @@ class IncrementalEstimator:
             self._know()
 
     def _restart(self) -> None:
-        """Go on from the optimum of the dive so far, with what it lets in."""
+        """Continue from the optimum of the dive so far, with its admitted measurements."""
         best = self._optimum()
         n, state = self._count, best.state
         calibration = {name: np.broadcast_to(value, (n, value.shape[-1])) for name, value in state.calibration.items()}
@@ -667,7 +667,7 @@ def run_isam2(
     update_s: float = 0.0,
     searches: Searches | None = None,
 ) -> IncrementalEstimator:
-    """iSAM2 that has taken the keyframes of a dive; ``progress`` is told 0 to 1 now and then."""
+    """iSAM2 that has taken the keyframes of a dive; ``progress`` receives 0 to 1 now and then."""
     estimator = IncrementalEstimator(initial, update_s, searches)
     for k in range(len(problem)):
         estimator.step(problem, k)

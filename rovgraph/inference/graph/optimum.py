@@ -109,7 +109,7 @@ def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Seq
         order.push_back(one)
     R, ends = root.jacobian(order)[0], np.cumsum([net.at(i).rows() for i in range(others, net.size())])[:-1]
     columns: dict[int, list[Array]] = {net.at(i).firstFrontalKey(): [] for i in range(others)}
-    for unit in R.T:  # what the given variables' own rows say where one component is 1, all others 0
+    for unit in R.T:  # the given variables' own rows where one component is 1, all others 0
         rhs = gtsam.VectorValues()
         for i in range(others):
             rhs.insert(net.at(i).firstFrontalKey(), np.zeros(net.at(i).rows()))

@@ -104,7 +104,7 @@ def known_preset(kind: str, name: str) -> str:
 
     Raises
     ------
-    PydanticCustomError : there is none; the nearest one is named
+    PydanticCustomError : no such preset; the nearest one is named
     """
     known = [p.name for p in presets().values() if p.kind == kind]
     if name not in known:
