@@ -259,7 +259,7 @@ def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> 
 
 
 def once(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Files without those that are given again, and what to say of it."""
+    """Files without repeated ones, and a warning of these."""
     given: dict[Path, Path] = {}
     said = []
     for path in files:

@@ -187,7 +187,7 @@ class LiveRun:
         """
         try:
             yield from self._solve()
-        except GeneratorExit:  # whoever iterates has had enough
+        except GeneratorExit:  # the caller stops iterating
             self._summarise()
             raise
         self._summarise()

@@ -19,7 +19,7 @@ class Statistic:
     sensor : what it is about: a stream of the log, "imu", or "dive"
     begin, end : the time that it is about [s]
     figure : the number
-    cause : what is so, with its figures
+    cause : what is wrong, with its figures
     remedy : what to do, naming a configuration key or a command
     factor : times the rule's limits
     chance : quantile of the figure's distribution in healthy dives, beyond which both limits lie

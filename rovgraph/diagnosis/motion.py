@@ -35,7 +35,7 @@ from rovgraph.problem.measurements import Measurements
 from rovgraph.rules import CHANCE, CLIPPED, CONTRADICTED, RULES, SETTLED_S, remedy_of_lag
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
-IMU_S = 20.0  # over which errors of the IMU last that are no noise
+IMU_S = 20.0  # over which errors of the IMU last, unlike noise
 # of a motion's residual: what people call it, columns, and the signal behind it
 PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
 # a bias's history, columns of a motion's residual, what people call it, its unit, and how many of them make one
@@ -322,7 +322,7 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
 
 
 class _Compared:
-    """Pings a few seconds apart, and how the IMU says that the velocity changed between them.
+    """Pings a few seconds apart, and the change of velocity between them by the IMU.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ class DvlPlace:
 
     @property
     def cause(self) -> str:
-        """What is so, in words."""
+        """The finding, in words."""
         named = zip(TABLE[ARM].labels, self.offset.tolist(), strict=True)
         where = ", ".join(f"{label[-1]} {off:+.2g} m" for label, off in named if off)
         return (
@@ -93,7 +93,7 @@ def _is_turned(best: ChainOptimum) -> bool:
 
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
-ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
+ALONE = ("fix", "ahrs")  # sensors of which only a time offset can be held at a wrong value
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
 LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
@@ -109,7 +109,7 @@ class UnstatedNoise:
     sensor : log stream
     key : of the configuration, that holds it
     values : what stands there with it; numbers, or keys of the section and theirs
-    cause, done : what is so, and what is done about it
+    cause, done : the finding, and what is done about it
     beliefs : the same, for the dive to be solved again
     """
 
@@ -199,7 +199,7 @@ def _placed(best: ChainOptimum, place: DvlPlace) -> UnstatedNoise:
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Iterator[Statistic]:
-    """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
+    """The same as alarms, of an estimate that does not use it; parameters are those of `find_noise`."""
     begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     for one in find_noise(best, config, alarms, UNLIKELY)[0] or find_errors(best, config, alarms)[0]:
         if not _is_allowed_for(one, best):
@@ -250,7 +250,7 @@ def noise_factor(r: Array) -> float | None:
 
 
 def _is_stated(best: ChainOptimum, sensor: str) -> bool:
-    """Whether a sensor's noise is the configuration's, and not what the log says of most measurements."""
+    """Whether a sensor's noise is the configuration's, and not the log's own of most measurements."""
     believed = best.chain.initial.instruments[sensor].sd
     dim = best.blocks[sensor].instrument.model.dim
     sd = best.problem.sd(best.problem.of_sensor(sensor), dim)

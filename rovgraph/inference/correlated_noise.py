@@ -374,7 +374,7 @@ def _fit_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovErro
 def _reopened(now: _Baseline, passed: Collection[str]) -> list[tuple[GaussMarkovError, _Baseline]]:
     """Errors of the table's size, each with all measurements admitted to begin with, and the dives with them.
 
-    Costs compare where other measurements are admitted; the likelihood, with an error's freedom, where they are the same.
+    Costs compare where other measurements are admitted; the likelihood where they are the same.
     """
     out, chain = [], now.chain
     plain = now.reopened(chain, now.solution.point)

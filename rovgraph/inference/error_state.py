@@ -255,7 +255,7 @@ class ErrorStateFilter:
     Attributes
     ----------
     initial : of `rovgraph.inference.initialise.initialise`
-    reinitialise_at : times since the start at which the dive so far is smoothed, and the filter continues from there [s]
+    reinitialise_at : times since the start at which the filter continues from the smoothed dive so far [s]
     learn_noise : of the IMU, from its newest samples
     problem : the dive, as far as it has been taken
     known : Gaussian of the newest keyframe, or what is believed before the first

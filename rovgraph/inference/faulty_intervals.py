@@ -138,7 +138,7 @@ def solve(
     ----------
     problem, point : the dive, and where to begin
     freed : the dive, from where it is linearised, with the uncertain constants that ``problem`` holds estimated: an
-        error that a mounting explains is no stretch's
+        error that a mounting explains needs no interval
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
     searches : that were made for other solutions of the same dive, as configured the same
     tolerance : as of `rovgraph.inference.gauss_newton.minimise`

@@ -125,7 +125,7 @@ def shown(best: Optimum) -> list[str]:
 
 
 def shown_below(best: Optimum, name: str) -> float:
-    """The sd of a constant, as a part of the prior's, below which a dive shows it: less where noise may cause spurious information."""
+    """The sd of a constant, as a part of the prior's, below which a dive shows it: less with spurious information."""
     if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not make spurious
         return OBSERVABLE_BELOW
     return DOUBTFUL_ABOVE if name in SPURIOUSLY_OBSERVABLE else OBSERVABLE_BELOW

@@ -225,8 +225,8 @@ def _slerp(time: Array, R: Array, at: Array) -> Array:
 def read_trajectory(path: Path | str) -> Trajectory:
     """Read a trajectory CSV: ``time, north, east``, the rest optional.
 
-    Columns that are missing are NaN in the result (rotations too), so that what a
-    file does not know cannot be mistaken for a zero.
+    Columns that are missing are NaN in the result (rotations too), so that a missing value
+    cannot be mistaken for a zero.
 
     Raises
     ------

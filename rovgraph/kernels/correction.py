@@ -250,8 +250,8 @@ def inflate(P: Array, found: Innovations, measurement: int, seen: Array, spread:
     """Inflate the covariance of what a sensor measures, as if moved by something that no model has.
 
     As a knock does to velocity and position: P += |x|^2 (seen seen' + spread spread'), x the least squares solution
-    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor measures, with what has
-    followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
+    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor measures, with what
+    has followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
     """
     n, s = seen.shape
     r, H, A, x = found.r, found.H, np.zeros((s, s)), np.zeros(s)

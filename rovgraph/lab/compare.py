@@ -71,7 +71,7 @@ def _summary(named: EstimatorSpec, runs: pd.DataFrame) -> dict[str, Any]:
 
 
 def _rms(values: pd.Series) -> float:
-    """Root of the mean of the squares, NaN where there are none."""
+    """Root of the mean of the squares, NaN without any."""
     return float(np.sqrt(values.pow(2).mean()))
 
 
@@ -294,7 +294,7 @@ def compare(
     """Run estimators on dives, in parallel, and measure them.
 
     The result does not depend on ``jobs``, the time it took aside. An estimator that fails
-    on a run has a row that says why.
+    on a run has a row with the reason.
 
     Parameters
     ----------

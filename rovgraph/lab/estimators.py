@@ -314,7 +314,7 @@ def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stag
 
 
 def _driven(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> EstimatorSpec:
-    """An estimator that knows thrusters and drag, with both headings."""
+    """An estimator with thrusters and drag, and both headings."""
     name, words = f"{kind}-hydrodynamics", f"{about}, {_WITH['a']}, thrusters and drag"
     return EstimatorSpec(name, family, words, "a", False, smoothing, (assembled, *stages), hydrodynamics=True)
 

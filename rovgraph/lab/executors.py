@@ -51,7 +51,7 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
     InputError : a process was killed from outside, or none could start
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker, which imports the caller's script
-        sys.exit(1)  # quietly: the caller says why
+        sys.exit(1)  # quietly: the caller reports why
     before = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")
     started = context.Event()
@@ -211,7 +211,7 @@ class Local:
 
 @dataclass(frozen=True)
 class _Work:
-    """Tasks, and how often each that is left has failed; what is finished is taken out of ``failures``."""
+    """Remaining tasks, and how often each has failed; finished ones are removed from ``failures``."""
 
     function: Callable[[Any], Any]
     tasks: Sequence[Any]
@@ -326,7 +326,7 @@ class Cluster:
 
 
 def _hush(*libraries: str) -> None:
-    """Keep libraries from logging what we say in a line of our own, tracebacks among it."""
+    """Keep libraries from logging errors, with tracebacks, that are reported in one line here."""
     for name in [*libraries, *logging.root.manager.loggerDict]:
         if name.split(".")[0] in libraries:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)

@@ -180,7 +180,7 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
             f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
         )
     dive = batch.optimum()
-    # what is not estimated because noise would move it is what is to be looked at
+    # shows constants that are not estimated because noise would bias them
     moved = [name for name in dive.unknowns.considered if dive.beliefs[name].estimate]
     dive = dive.estimating(moved) if moved else dive
     if not dive.unknowns.estimated:
@@ -294,7 +294,7 @@ def in_words(information: Array, labels: Sequence[str], units: Sequence[str], pr
 def _apart(axes: Array) -> Array:
     """Directions, shape (k, c), that span the same as k given ones, of as few components each as elimination leaves.
 
-    Axes of nearly one eigenvalue are any mixture of each other, and would tell the same twice.
+    Axes of nearly one eigenvalue are any mixture of each other, and would repeat each other.
     """
     if len(axes) < 2:
         return axes

@@ -63,7 +63,7 @@ def _number(speed: str, text: str) -> float:
 
 
 IMU_HZ, DVL_HZ = (5.0, 1000.0), (0.1, 50.0)  # rates that can be planned with
-MOST_COLUMNS = 6  # of a table, where no goal says what matters
+MOST_COLUMNS = 6  # of a table, without goals
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class KnownComponents:
         return KnownComponents((), np.zeros((0, 0)), np.zeros(0))
 
     def information(self, labels: Sequence[str], sd: Array) -> Array:
-        """What its data say of some components, shape (c, c), in units of ``sd``; what it also knew is marginalised."""
+        """Information of its data on some components, shape (c, c), in units of ``sd``; the others are marginalised."""
         both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in labels]
         out = np.zeros((len(labels), len(labels)))
         if both:
@@ -189,7 +189,7 @@ def plan(
 
     Parameters
     ----------
-    config : what is believed of vehicle and sensors, and what is to be estimated
+    config : vehicle and sensors as configured, and what to estimate
     candidates : the manoeuvres
     duration : of each [s]
     known : from dives before
@@ -235,7 +235,7 @@ def _check(goals: Mapping[str, float], estimated: Sequence[str]) -> None:
 
 
 def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
-    """A manoeuvre in calm water: what waves would teach nobody can promise."""
+    """A manoeuvre in calm water: the information from waves cannot be planned."""
     return scenario(manoeuvre.name, duration, manoeuvre.speed, Style(waves=CALM))
 
 

@@ -82,7 +82,7 @@ class Simulated:
         return f"{self.scenario} {self.seed}"
 
     def load(self) -> Case:
-        """The dive, and what an estimator may know of it.
+        """The dive, and the configuration for an estimator.
 
         Raises
         ------

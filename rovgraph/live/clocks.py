@@ -110,7 +110,7 @@ class Clocks:
 
         Raises
         ------
-        InputError : recordings whose clocks are of different epochs, and whose arrivals do not tell by how much
+        InputError : recordings whose clocks are of different epochs, and whose arrivals do not give the shift
         """
         if message.stamp is None:
             return message.arrival if self._base is None else message.arrival - self._base.delay.value
@@ -147,7 +147,7 @@ class Clocks:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Know what another has learnt."""
+        """Take over what another has learnt."""
         for known in state["clocks"]:
             delay = _LeastDelay()
             delay.pieces.extend((arrival, least) for arrival, least in known["delay"])
@@ -157,7 +157,7 @@ class Clocks:
                 self._base = clock
 
     def _unwrapped(self, stamp: float, clock: _Clock) -> float:
-        """A stamp, of a counter that goes on where it wraps; of a late message from before that, less its range [s]."""
+        """A stamp, continued where a counter wraps; of a late message from before that, less its range [s]."""
         newest = stamp if clock.newest is None else clock.newest
         if late := counter_range(stamp, newest):
             return stamp - late

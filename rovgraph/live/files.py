@@ -174,7 +174,7 @@ class Keeper:
     Parameters
     ----------
     path : of the checkpoint
-    warnings : told from that thread where it cannot be written; it goes on trying
+    warnings : receives, from that thread, that it cannot be written; it keeps trying
     """
 
     def __init__(self, path: Path, warnings: Warnings) -> None:
@@ -229,8 +229,8 @@ class Recorder:
 
     Parameters
     ----------
-    path : a new file, or a recording to go on with; its last line is dropped where it was cut off
-    warnings : told, from other threads too, of what goes wrong later
+    path : a new file, or a recording to continue; its last line is dropped where it was cut off
+    warnings : receives later errors, from other threads too
 
     Attributes
     ----------
@@ -382,7 +382,7 @@ class TrackFile:
 
     Parameters
     ----------
-    path : new, or to go on with
+    path : new, or to continue
     until : keep rows of an older file up to this time [s]; the rest comes again
 
     Raises
@@ -455,17 +455,17 @@ class Files:
     folder : an existing one
     config : as the user gave it
     warnings : where trouble with the disk goes
-    resume : go on with what is there
+    resume : continue with what is there
     replayed : from the recording alone, not from the checkpoint
 
     Attributes
     ----------
-    state : the checkpoint that is resumed; None where there is none
+    state : the checkpoint that is resumed; None without one
     received : what had been received after it; None where there is nothing
 
     Raises
     ------
-    InputError : the folder cannot be written, or holds nothing to go on with, or a recording that cannot be read
+    InputError : the folder cannot be written, or holds nothing to continue, or a recording that cannot be read
     """
 
     folder: Path
@@ -571,7 +571,7 @@ class Files:
         return True
 
     def finish(self, navigator: Navigator) -> None:
-        """Put the end of the track on disk; the checkpoint stays where it was, from there one may go on."""
+        """Put the end of the track on disk; a run can still be resumed from the checkpoint."""
         if navigator.engine is not None:
             self._add(navigator, navigator.engine)
 
@@ -581,13 +581,13 @@ class Files:
 
 
 class KnownSources(dict[str, float]):
-    """What sources have found out and a resumed run goes on with, such as the pressure at the surface, in a file.
+    """Values that sources have found and a resumed run needs, such as the pressure at the surface, in a file.
 
     Parameters
     ----------
     folder : of the run; None = it is not kept
-    resume : go on with what is there
-    warnings : told where it cannot be written
+    resume : continue with what is there
+    warnings : receives that it cannot be written
     """
 
     def __init__(self, folder: Path | None, resume: bool, warnings: Warnings) -> None:

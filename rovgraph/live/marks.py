@@ -55,7 +55,7 @@ class Marks:
     ----------
     folder : of the results; None = they are kept in memory
     warnings : where trouble with the disk goes
-    resume : go on with the marks that are there
+    resume : keep the marks that are there
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Marks:
         self._newest = max((mark.number for mark in self.all), default=0)
 
     def drop(self, name: str, at: Solution, north: float | None = None, east: float | None = None) -> Mark:
-        """Add a way-point at a place [m], or a mark where a solution says that the vehicle is."""
+        """Add a way-point at a place [m], or a mark at the position of a solution."""
         self._newest += 1
         if north is not None and east is not None:
             mark = Mark(self._newest, "waypoint", name, at.time, north, east)

@@ -10,7 +10,7 @@ from rovgraph.geometry import Array
 
 @dataclass(frozen=True)
 class Event:
-    """Something that a person should know.
+    """An event that a person should know.
 
     Attributes
     ----------

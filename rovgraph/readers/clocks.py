@@ -56,7 +56,7 @@ class Offset:
     seconds, sd : at the time ``at`` of clock A [s]
     drift, drift_sd : of B against A
     at : middle of the overlap, by clock A [s]
-    overlap : that both recordings know [s]
+    overlap : time that both recordings cover [s]
     explained : part of the motion's square that the two share
     how : what was compared
     """
@@ -77,7 +77,7 @@ class Offset:
 
 
 def find_offset(a: MotionSignals, b: MotionSignals) -> Offset | None:
-    """The offset of two recordings' clocks, by all quantities that both show; None where these do not tell.
+    """The offset of two recordings' clocks, by all quantities that both show; None where these do not determine it.
 
     Candidates are the lags at which all together agree best; each is refined by every quantity. The best candidate
     counts if it explains the motion far better than any other, and the quantity with the least sd gives its offset.
@@ -407,7 +407,7 @@ def join_clocks(
 
 
 def _axes(file: int, recording: Recording) -> tuple[list[_Axis], list[str]]:
-    """The axes of a file, and what to say of clocks that were never set."""
+    """The axes of a file, and warnings of clocks that were never set."""
     known: dict[str, ClockLine] = {}
     sources: dict[str, tuple[str, float]] = {}
     said = []

@@ -23,7 +23,7 @@ from rovgraph.log.disk_columns import GrowingColumn, taken
 
 HEAD = b"\xa3\x95"
 FMT = 128  # type of the message that defines all others, itself too
-INSTANCE = ("I", "Instance")  # fields that say which of several sensors it is
+INSTANCE = ("I", "Instance")  # fields with the number of the sensor
 BLOCK = 1 << 22  # bytes walked at a time
 _PLACE = " place"  # no field has a blank in its name
 
@@ -90,7 +90,7 @@ class DataflashMessages:
     ----------
     fields : field -> ndarray, shape (n,), as stored: without multipliers; integers of 64 bits as floats. Not to be
         changed: long ones are in temporary files (`rovgraph.log.disk_columns`)
-    units : field -> its unit's label, such as "m/s/s"; "" where the file does not say
+    units : field -> its unit's label, such as "m/s/s"; "" where the file does not state it
     multipliers : field -> factor that makes that unit of what is stored
     """
 
@@ -124,7 +124,7 @@ class Contents:
     counts : name -> how many there are, of all
     instances : name -> instances that there are, of those of which one was wanted
     unlike : name -> how many were wanted, but have other fields or types of them than the first of that name
-    damaged : stretches of bytes that are no message
+    damaged : stretches of bytes between messages
     damaged_bytes : bytes in them, without a message that the end of the file cuts off
     cut_off : bytes of that message
     """
@@ -245,7 +245,7 @@ class _Walk:
             self._sane |= final > index
             place, after = int(heads.at[final]), int(heads.after[final])
             if after > heads.end or (after > place and after + 2 > heads.end and not last):
-                break  # goes on in the next block, or is cut off by the end of the file
+                break  # continues in the next block, or is cut off by the end of the file
             if heads.sound[final]:
                 taken[final] = self._sane = True
                 place = after
@@ -353,7 +353,7 @@ def _dtype_in_memory(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def instances(rows: NDArray[Any]) -> NDArray[Any] | None:
-    """Of which instance rows of messages are, shape (n,); None where their format knows none."""
+    """Of which instance rows of messages are, shape (n,); None where their format has no instances."""
     return next((rows[name] for name in INSTANCE if name in (rows.dtype.names or ())), None)
 
 

@@ -85,7 +85,7 @@ class InertialMeasurement:
     sensor, label, warning : of a `InertialSource`
     time : ndarray, shape (n,) [s]
     values : ndarray, shape (n, k), columns as in `COLUMNS`, SI and radians, a field in microtesla
-    world : of an attitude, a key of `WORLDS`; "" = gravity tells
+    world : of an attitude, a key of `WORLDS`; "" = found by gravity
     true_north : an attitude's yaw is relative to it, not to magnetic north
     """
 
@@ -109,7 +109,7 @@ class InertialMeasurement:
 
 @dataclass
 class Account:
-    """What is said of a file.
+    """Warnings and settings of a file.
 
     Attributes
     ----------

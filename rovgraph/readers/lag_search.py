@@ -81,7 +81,7 @@ class MotionSignal:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """What an IMU feels without gravity, along its own axes.
+    """An IMU's acceleration without gravity, along its own axes.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class Sums:
     Attributes
     ----------
     lags : ndarray, shape (l,) [s]
-    seconds : ndarray, shape (l,), that both recordings know
+    seconds : ndarray, shape (l,), that both recordings cover
     total, error : ndarray, shape (l,), sums of squares before and after
     parameters : ndarray, shape (l, p), of the best fit
     """
@@ -331,7 +331,7 @@ class Accelerations:
         normal = np.einsum("lm,tkn->tlkmn", np.eye(3), own) + np.einsum("tlmkn->tlkmn", mixed + turned)
         normal = (normal + np.einsum("tmlnk->tlkmn", mixed)).reshape(-1, 81)
         right = _correlate(a, dv) + _correlate(np.einsum("til,ti->tl", G, a), v)
-        # and those of the arm's part Y l, which clock A alone knows, with what it explains without the DVL
+        # and those of the arm's part Y l, which only clock A has, with what it explains without the DVL
         Y = _by_arm(both[:, 3:6], both[:, 6:9])
         information = _correlate(np.einsum("tij,tik->tjk", Y, Y), seen).reshape(-1, 3, 3)
         ridge = RIDGE * np.trace(information, axis1=1, axis2=2) + TINY

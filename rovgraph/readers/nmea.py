@@ -80,7 +80,7 @@ def relative_position(text: str, last: float | None) -> tuple[str, tuple[float, 
     Parameters
     ----------
     text : of the sentence, whose checksum is right
-    last : time of that sentence, None = there is none [s]
+    last : time of that sentence, None = without one [s]
 
     Raises
     ------
@@ -218,7 +218,7 @@ def _ship(fixes: Channel, heading: Channel | None) -> Ship:
 
 
 class _Sentences:
-    """Takes sentences one by one; rows know their place in the file.
+    """Takes sentences one by one; rows keep their place in the file.
 
     Attributes
     ----------
@@ -416,7 +416,7 @@ class _Sentences:
         return made
 
     def _ships_heading(self, place: Array, time: Array) -> Channel | None:
-        """Of the acoustic system, where no gyrocompass speaks for itself."""
+        """Of the acoustic system, where no gyrocompass has sentences of its own."""
         rows = next((rows for (of, _), rows in self._rows.items() if of == SHIPS_ATTITUDE), None)
         if rows is None:
             return None
@@ -424,7 +424,7 @@ class _Sentences:
         return Channel("ahrs", {"time": np.interp(at, place, time), "ahrs_yaw": heading}, SHIPS_ATTITUDE)
 
     def _look(self, channels: list[Channel], said: list[str]) -> tuple[dict[str, Any], list[str]]:
-        """Settings that the file knows, and what may be wrong beside what is ``said``."""
+        """Settings from the file, and possible errors beside ``said``."""
         warnings, environment = [*said], {}
         talkers = [channel.source for channel in channels if channel.sensor == "fix"]
         if talkers:

@@ -20,7 +20,7 @@ from rovgraph.geometry import Array
 from rovgraph.readers.recording import Channel
 
 FRAME = "X, Y, Z of the instrument: forward, starboard, down as it is drawn"
-LONGEST_DELAY_S = 5.0  # from a stamp to the echo; more is none
+LONGEST_DELAY_S = 5.0  # from a stamp to the echo; more is invalid
 BAR = 1e5  # [Pa]
 
 

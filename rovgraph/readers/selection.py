@@ -131,7 +131,7 @@ def require_used(
 
 
 def _span(recording: Recording, channel: Channel) -> tuple[float, float, str] | None:
-    """First and last stamp, and by which time: `UNIX`, or that of a clock whose name says no more [s]."""
+    """First and last stamp, and by which time: `UNIX`, or that of an unknown clock [s]."""
     offset, time = recording.unix_offset(channel.clock), channel.columns["time"]
     if not len(time):
         return None
@@ -259,7 +259,7 @@ def why_apart(first: _File, last: _File, later: _File) -> str:
 
 
 def _once(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
-    """Recordings without those that repeat another one, and what to say of it."""
+    """Recordings without those that repeat another one, and warnings of these."""
     kept: list[Recording] = []
     said = []
     for each in recordings:

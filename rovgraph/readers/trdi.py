@@ -89,11 +89,11 @@ WATER = "dvl_water_vx", "dvl_water_vy", "dvl_water_vz"
 
 @dataclass(frozen=True)
 class Pings:
-    """What n ensembles say, in SI.
+    """The values of n ensembles, in SI.
 
     Attributes
     ----------
-    time : shape (n,), as if its calendar were UTC [s since 1970]; NaN where the date is none
+    time : shape (n,), as if its calendar were UTC [s since 1970]; NaN where the date is invalid
     system : shape (n,), coordinates
     velocity, water : shape (n, 3), over the bottom and through the water, axes as `FRAME` says; NaN = none [m/s]
     error : shape (n,), error velocity of the bottom track [m/s]
@@ -134,7 +134,7 @@ def recording(
     Parameters
     ----------
     name : of the file's format
-    left, warnings : what its reader has to say
+    left, warnings : of its reader
 
     Raises
     ------

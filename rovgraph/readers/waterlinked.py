@@ -62,7 +62,7 @@ def is_report(row: dict[str, Any]) -> bool:
 
 
 def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
-    """What a report says of a velocity; None where it is a report of something else.
+    """The velocity of a report; None for another kind of report.
 
     Raises
     ------
@@ -312,7 +312,7 @@ class _Reports:
         index = np.flatnonzero(stamped)
         time = validity[index].copy()
         set_at = np.flatnonzero((time[:-1] < SET) & (time[1:] >= SET)) + 1
-        for at in set_at.tolist():  # the report itself says how long it came after the last one
+        for at in set_at.tolist():  # the report itself has the time since the last one
             step = since[index[at]]
             if np.isfinite(step) and 0.0 <= step < 60.0:
                 shift = time[at] - step - time[at - 1]

@@ -216,7 +216,7 @@ def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
 
 
 def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
-    """Roll, pitch and heading with ±2 sd, and what the compasses said."""
+    """Roll, pitch and heading with ±2 sd, and the compasses' headings."""
     main, clock = estimates[0], TimeAxis.of(estimates[0])
     samples = heading_samples(main.trajectory, log, config)
     heights = (1.0, 1.0, 1.6, 1.1) if samples else (1.0, 1.0, 1.6)

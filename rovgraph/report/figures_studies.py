@@ -75,7 +75,7 @@ def draw_comparison(folder: Path, comparison: Comparison, title: str, thesis: bo
 def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str, thesis: bool = False) -> Figure:
     """End, heading and velocity errors of every run as dots, their mean over runs marked; log axes.
 
-    What the reference does not know has no panel.
+    Quantities that the reference lacks have no panel.
     """
     names = table["estimator"].tolist()
     panels = {
@@ -292,7 +292,7 @@ def draw_study(folder: Path, tables: Tables) -> list[Path]:
 
 
 def draw_error(tables: Tables) -> Figure | None:
-    """Error against time: band that 90 % of the runs are in, and what the filter says, ±1.96 sd; a panel per cell."""
+    """Error against time: band that 90 % of the runs are in, and the filter's ±1.96 sd; a panel per cell."""
     names = dict(zip(tables.cells["cell"], labels(tables), strict=True))
     chosen = [cell for cell in names if (tables.history["cell"] == cell).any()][:MOST_PANELS]
     if not chosen:

@@ -46,7 +46,7 @@ def write_study(folder: Path, tables: Tables, about: Mapping[str, Any]) -> None:
 
 
 def labels(tables: Tables) -> list[str]:
-    """What tells each row of ``cells`` from the others: the grid's parameters, and others where they are unusual."""
+    """Labels that distinguish the rows of ``cells``: the grid's parameters, and others where they are unusual."""
     usual = _usual(tables)
     return [
         ", ".join(

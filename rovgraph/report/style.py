@@ -60,7 +60,7 @@ _RC: dict[str, Any] = {
 
 @contextlib.contextmanager
 def style() -> Iterator[None]:
-    """The look of our figures, whatever the user's matplotlibrc says; restored afterwards."""
+    """The style of all figures, whatever the user's matplotlibrc; restored afterwards."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)  # type: ignore[arg-type]

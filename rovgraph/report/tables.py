@@ -78,7 +78,7 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
 
 
 def duration(seconds: float | None) -> str:
-    """Time as a person says it, such as ``55 min 43 s``."""
+    """Time in words, such as ``55 min 43 s``."""
     if seconds is None:
         return "unknown"
     minutes, rest = divmod(round(seconds), 60)

@@ -121,7 +121,7 @@ def draw_lasting(
 
     Parameters
     ----------
-    truth : says which
+    truth : has their times
     calibration : where they begin
     seconds : how long they go on [s]
     rng : the same seed gives the same errors; its own stream stays as it is
@@ -157,7 +157,7 @@ class Dive:
     truth : Trajectory at the IMU's epochs, without uncertainty
     hidden : "calibration": name -> ndarray, shape (dim,), of an error that lasts at the end of the dive; "lasting":
         `LastingErrors`, all of these; "bias": ndarray, shape (n, 6), at the epochs of ``truth``; "start_offset":
-        ndarray, shape (3,) [m]; "world": name -> ndarray, what else is so and an estimator must not know
+        ndarray, shape (3,) [m]; "world": name -> ndarray, other true values, hidden from an estimator
     path : the path that was followed
     """
 
@@ -230,7 +230,7 @@ class _Sampler:
         self.covariances = truth.covariances if truth.noise else None
 
     def motion(self, sensor: str, path: Path, stamps: Array) -> Motion:
-        """The motion that a sensor measured: stamps are as late as its time offset says."""
+        """The motion that a sensor measured: stamps are late by its time offset."""
         offset = self.instruments[sensor].time_offset
         late = 0.0 if offset is None else float(self.calibration[offset][0])
         return path.motion(np.clip(stamps - late, 0.0, path.duration))

@@ -481,7 +481,7 @@ class Driven:
     ----------
     make : from a world to a path and what its sensors obey
     choices : names of the choices it has
-    variants : that it has, the first is the default unless ``about`` says otherwise
+    variants : that it has, the first is the default unless ``about`` states another
     about : one line for people
     """
 

@@ -24,7 +24,7 @@ from rovgraph.sensors.instruments import DEFAULT_DIP
 from rovgraph.simulate.path import Path
 
 EARTH_FIELD_T = 50.5e-6  # magnitude in southern Sweden, the unit of the thesis's normalised field [T]
-# Moment of iron by its mass: 1000 kg are felt as 1 nT at 30 m (a rule of Geometrics'), which is
+# Moment of iron by its mass: 1000 kg give 1 nT at 30 m (a rule of Geometrics'), which is
 # 2e-7 m / 30^3 = 1 nT for an induced 0.135 A m^2/kg; what iron keeps of its past is a few times
 # as much (Breiner 1973, Applications manual for portable magnetometers: 0.1 to 1 A m^2/kg).
 INDUCED_PER_KG = 0.135
@@ -77,7 +77,7 @@ class Distortion:
     offset: Array
 
     def raw(self, field: Array) -> Array:
-        """What the magnetometer says of a field, both of shape (n, 3)."""
+        """The magnetometer's reading of a field, both of shape (n, 3)."""
         return np.asarray((field - self.offset) / self.scale)
 
 

@@ -55,7 +55,7 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
 
     Returns
     -------
-    Dive, and the Config that an estimator may know: with the planned start
+    Dive, and the Config for an estimator: with the planned start
 
     Raises
     ------

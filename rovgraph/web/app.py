@@ -174,7 +174,7 @@ BURST, PER_S = 20, 5.0  # commands that are taken at once, and a second in the l
 
 
 class _Number(IntegerConvertor):
-    """A number in a path; one of thousands of digits, which Python does not convert, is none."""
+    """A number in a path; one of thousands of digits, which Python does not convert, is refused."""
 
     regex = "[0-9]{1,10}"
 
@@ -268,7 +268,7 @@ class Allowance:
 
         Raises
         ------
-        Refusal : there is none left
+        Refusal : the allowance is used up
         """
         now = time.monotonic()
         self._left = min(float(BURST), self._left + PER_S * (now - self._at))
@@ -288,7 +288,7 @@ def application(broadcast: Broadcast, charts: Charts, offer: Offer | None) -> St
     ----------
     broadcast : to pages
     charts : drawn below the track
-    offer : takes commands, and says whether there was room; None = nothing can be changed
+    offer : takes commands, and returns whether there was room; None = nothing can be changed
     """
 
     @contextlib.asynccontextmanager
@@ -319,7 +319,7 @@ def _page(static: str) -> Callable[[Request], Response]:
 
 
 def _reading(broadcast: Broadcast) -> list[BaseRoute]:
-    """What only tells something."""
+    """Addresses that only inform."""
     view, metrics = broadcast.view, MetricsCollector(broadcast)
 
     async def state(request: Request) -> Response:

@@ -93,7 +93,7 @@ def parse_origin(text: str) -> str:
 
     Raises
     ------
-    InputError : it is none
+    InputError : it is not such an origin
     """
     try:
         parts = urlsplit(text)

@@ -21,11 +21,11 @@ from rovgraph.web.view import PageLimits, View
 
 START_S, CLOSE_S = 10.0, 2.0
 MOST_CONNECTIONS = 64
-LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, which has nothing to say [bytes]
+LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, on which pages send no data [bytes]
 
 
 class LivePage:
-    """Shows solutions to whoever opens the page.
+    """Shows solutions to all that open the page.
 
     `send` is called with each solution and only queues it. The server stops with `close`, or at the end of a ``with``.
 
@@ -38,7 +38,7 @@ class LivePage:
     origins : of other pages that may frame this one
     token : file that keeps the token; None = a new one each time
     limits : beyond which the page raises an alarm
-    warnings : told if the server fails
+    warnings : receives a failure of the server
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class LivePage:
 
     Raises
     ------
-    InputError : an address that cannot be listened at, a chart that cannot be read, an origin or token that is none
+    InputError : an address that cannot be listened at, a chart that cannot be read, an invalid origin or token
     """
 
     def __init__(
@@ -116,5 +116,5 @@ class LivePage:
     def _run(self) -> None:
         try:
             self._server.run(sockets=[self._socket])
-        except Exception as error:  # the estimate goes on without its page
+        except Exception as error:  # the estimate continues without its page
             self._warnings.complain(self.address.url, "failed", f"the page is gone: {type(error).__name__}: {error}")

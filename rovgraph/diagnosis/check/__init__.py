@@ -32,7 +32,7 @@ from rovgraph.sensors.instruments import heading_sources
 
 
 def plan(log: Log, config: Config) -> Iterator[Finding]:
-    """What would be used, and what is assumed where the configuration says nothing."""
+    """Sensors that would be used, and assumptions where the configuration states no value."""
     sources = heading_sources(config, log.sensors)
     yield Finding("configuration", "ok", f"heading from {', '.join(sources) or 'the start only'}")
     wanted = {sensor.heading_source: sensor.name for sensor in SENSORS.values()}
@@ -141,7 +141,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     ----------
     log : as read
     config : what is believed of the vehicle; defaults where it is not given
-    examined : what `bridge_jumps` knows of the log with this configuration
+    examined : result of `bridge_jumps` for the log with this configuration
     """
     config = Config() if config is None else config
     frozen = frozen_stretches(log, config)

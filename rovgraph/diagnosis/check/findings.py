@@ -44,7 +44,7 @@ class Finding:
 
     @property
     def of_clock(self) -> bool:
-        """Whether it says that a clock is late, early or set."""
+        """Whether it reports that a clock is late, early or set."""
         return self.kind in CLOCKS
 
 
@@ -99,7 +99,7 @@ class Report:
         return [f for f in self.findings if f.wrong and (f.sensor in used or f.sensor not in HEADING_STREAMS)]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; what is not known is None."""
+        """For JSON; unknown values are None."""
         known: dict[str, Any] = _without_nan(asdict(self))
         for finding, written in zip(self.findings, known["findings"], strict=True):
             written["wrong"] = finding.wrong

@@ -83,7 +83,7 @@ class _Tracks:
 
 
 def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | None:
-    """The DVL's track by the heading that tells most, or by one compass; None where something is missing."""
+    """The DVL's track by the heading that determines it best, or by one compass; None where something is missing."""
     if not {"dvl", "fix"} <= log.sensors:
         return None
     others = {name: s for name, s in log.streams.items() if compass in (None, name) or name not in OFFSETS}

@@ -375,7 +375,7 @@ class MagnetometerCalibration:
 
 @dataclass(frozen=True)
 class _Shape:
-    """Centre, matrix of any scale, and what else a method says."""
+    """Centre, matrix of any scale, and other results of a method."""
 
     centre: Array
     matrix: Array

@@ -275,7 +275,7 @@ def _background(frequency: Array, density: Array) -> Array:
 
 
 def _running_median(level: Array, width: int) -> Array:
-    """Median over ``width`` values; a slope (of a walk) goes on below the first, what is above the last is like it."""
+    """Median over ``width`` values; a slope (of a walk) continues below the first; above the last it is constant."""
     half = min(width // 2, len(level) - 1)
     padded = np.pad(np.pad(level, (half, 0), mode="reflect", reflect_type="odd"), (0, half), mode="symmetric")
     return np.asarray(median_filter(padded, size=2 * half + 1)[half : len(padded) - half])
@@ -340,7 +340,7 @@ def require_still(log: Log) -> None:
 
     Raises
     ------
-    InputError : says which sensor shows it, when and how much
+    InputError : names the sensor that shows it, when and how much
     """
     for watch in _WATCHES:
         if watch.sensor in log and not (watch.angle and "imu" in log):
@@ -439,7 +439,7 @@ class Peak:
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """What a log at rest says about its sensors.
+    """Noise of sensors from a log at rest.
 
     Attributes
     ----------
@@ -450,7 +450,7 @@ class NoiseReport:
         components, and ndarray, shape (k, k) [products of the channels' units]
     peaks : strongest first within a sensor
     piece : keys of a configuration
-    remarks : what the log could not say, a sentence each
+    remarks : what the log could not determine, a sentence each
     """
 
     source: str

@@ -150,7 +150,7 @@ class Ledger:
 
 @contextlib.contextmanager
 def kept_so_far(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into an `InputError` that says how to go on."""
+    """Turn an error of the file system into an `InputError` that states how to continue."""
     try:
         yield
     except OSError as error:

@@ -167,7 +167,7 @@ class Process(Protocol):
         ...
 
     def noise(self, x: Array) -> Array:
-        """Q of one second, shape (..., n, n), or the diagonal alone, ``diagonal`` says so."""
+        """Q of one second, shape (..., n, n), or the diagonal alone, by ``diagonal``."""
         ...
 
     @classmethod

@@ -191,7 +191,7 @@ class Recursion:
 
 
 def run_together(members: Sequence[Recursion]) -> None:
-    """Filters of one kind (`Filter.kind`) over their whole logs; ``error`` says of each whether it diverged."""
+    """Filters of one kind (`Filter.kind`) over their whole logs; ``error`` marks those that diverged."""
     whole = timetable(
         [m.setup.log["imu"].time for m in members],
         [np.array([ping.time for ping in m.setup.pings]) for m in members],
@@ -229,7 +229,7 @@ class _Batch:
         self._time, self._epoch = np.array([m.time for m in members]), np.array([m.epoch for m in members])
 
     def run(self, table: Timetable, first: int) -> int:
-        """Go on with step ``first`` until a member is through or diverges; the step to go on with then."""
+        """Continue with step ``first`` until a member is through or diverges; returns the next step."""
         whole = np.diff(table.time, axis=0, prepend=table.time[:1])
         count = np.ceil(whole / LONGEST_STEP_S)  # of steps that forward Euler bears
         parts, dt = count.max(axis=1).astype(int).tolist(), whole / np.maximum(count, 1.0)
@@ -304,7 +304,7 @@ class _Batch:
         return np.stack([m.state(*at) for m, *at in zip(self._true_motion, self._time.tolist(), x, strict=True)])
 
     def _diverged(self) -> bool:
-        """Whether any has; it is told so."""
+        """Whether any has diverged, which is noted in it."""
         if math.isfinite(np.vdot(self._x, self._x)):
             return False
         diverged = np.flatnonzero(~np.isfinite((self._x * self._x).sum(axis=1))).tolist()

@@ -188,7 +188,7 @@ class FilterJob:
 def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory | None = None) -> Estimate:
     """Run one of the thesis's filters.
 
-    Heading sources are the filter's own, whatever ``heading.sources`` says; calibration
+    Heading sources are the filter's own, whatever ``heading.sources`` is; calibration
     stands at its means but for what the filter has as states; nothing is gated.
 
     Parameters

@@ -146,7 +146,7 @@ def _demand(variant: Filter, log: Log, config: Config) -> None:
 
 
 def _with_sources(variant: Filter, log: Log, config: Config) -> Config:
-    """The configuration with the heading sources of the filter, whatever it says itself."""
+    """The configuration with the heading sources of the filter in place of its own."""
     if variant.attitude_given:
         sources = ["ahrs" if "ahrs" in log else "mag"]
     else:

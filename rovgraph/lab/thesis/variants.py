@@ -61,7 +61,7 @@ class Filter:
     noise_frame : axes that `Numbers.acceleration` belongs to, None = the process's own;
         it matters only where the three differ
     iterations : of a measurement update; 1 = EKF
-    linearized_at : "estimate", or "truth": Jacobians at the true motion, which a study knows
+    linearized_at : "estimate", or "truth": Jacobians at the true motion, available in a study
     compass_mount : the DVL's angles in its compass heading, where they are states:
         "estimated", or "held" at their means, as psi_DVL of (3.17) may be read
     """

@@ -35,7 +35,7 @@ def open_output(url: str, warnings: Warnings | None = None, patient: bool = Fals
     Parameters
     ----------
     url : one of `FORMS`, with options as in ``udp://host:port?rate=5``
-    warnings : told, from other threads too, of what goes wrong later
+    warnings : receives later errors, from other threads too
     patient : standard output waits for its reader instead of dropping lines, as a replay may
 
     Raises

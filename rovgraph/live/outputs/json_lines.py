@@ -132,8 +132,8 @@ LOOPBACK = "127.0.0.1"
 class TcpOutput(Output):
     """Listens, on the loopback unless a host is written, and sends every line to every reader.
 
-    A reader that is too slow loses lines, the oldest first, and holds up nobody. Nothing
-    waits: readers are let in, and queues emptied as far as they go, when a solution is sent.
+    A reader that is too slow loses lines, the oldest first, and does not delay others. Sending never
+    waits: readers are accepted, and queues emptied as far as they go, when a solution is sent.
 
     Raises
     ------
@@ -227,7 +227,7 @@ class _Reader:
                 self._begun = self._begun[self.socket.send(self._begun) :]
 
     def close(self) -> None:
-        """End the connection; what the reader said is taken first, or the system would cut it off."""
+        """End the connection; the reader's bytes are taken first, or the system would cut it off."""
         with contextlib.suppress(OSError):
             self.socket.recv(1 << 16)
             self.socket.shutdown(socket.SHUT_WR)

@@ -54,7 +54,7 @@ class Url(NamedTuple):
 
         Raises
         ------
-        InputError : it is none, or not from ``low`` to ``high``
+        InputError : not a number, or not from ``low`` to ``high``
         """
         if option not in self.options:
             return default
@@ -129,7 +129,7 @@ class Output(ABC):
         self._complaints.complain(self.url.text, kind, text)
 
     def _drop(self, count: int, kind: str, text: str) -> None:
-        """Count what is given up, and say it; from any thread."""
+        """Count what is given up, and report it; from any thread."""
         with self._counting:
             self.dropped += count
         self._complain(kind, f"{text}; {self.dropped} dropped so far")

@@ -29,7 +29,7 @@ from rovgraph.model.config import Config
 from rovgraph.readers.mavlink import IMUS
 
 LOOPBACK = "127.0.0.1"
-_OPTIONS = re.compile(r"\?(?=\w+=)")  # a question mark in a file's name is none
+_OPTIONS = re.compile(r"\?(?=\w+=)")  # a question mark in a file's name is not an option
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class SourceUrl:
 
         Parameters
         ----------
-        readers : name -> from text to value; raises ValueError, whose message says what was expected
+        readers : name -> from text to value; raises ValueError, whose message states what was expected
 
         Raises
         ------
@@ -146,7 +146,7 @@ def one_of(*known: str) -> Callable[[str], str]:
 
 MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
-Known = MutableMapping[str, float]  # what a source has found out and a run that is resumed goes on with
+Known = MutableMapping[str, float]  # values that a source has found and a resumed run needs
 Opener = Callable[[SourceUrl, Notify, Config, float, Known], Source]
 FORMS = {
     "-": "-",
@@ -200,7 +200,7 @@ def open_source(
     speed: str = "1",
     known: Known | None = None,
 ) -> Source:
-    """The source of a URL; docs/online-sources.md says which there are.
+    """The source of a URL; docs/online-sources.md lists them.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def _pace(text: str) -> float:
 
 
 def _unknown(address: SourceUrl) -> InputError:
-    """What to say of a URL of no known form, with the form that was probably meant."""
+    """Message on a URL of unknown form, with the form that was probably meant."""
     known = f"known are {', '.join(FORMS.values())}"
     if Path(address.url).suffix.lower() == ".tlog":
         meant = f"mavlink:{address.url}"

@@ -119,7 +119,7 @@ def waterlinked(url: str, notify: Notify) -> LineDecoder:
 
 
 def report_message(row: dict[str, Any], url: str, arrival: float, notify: Notify) -> Message | None:
-    """What a report says; None where it is about no measurement.
+    """The readings of a report; None without a measurement.
 
     Raises
     ------

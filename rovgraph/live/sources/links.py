@@ -132,7 +132,7 @@ def _received(connection: socket.socket, stop: threading.Event) -> Iterator[Chun
 
 
 class UdpLink:
-    """Listens for datagrams, from whoever sends them.
+    """Listens for datagrams, from any sender.
 
     Parameters
     ----------
@@ -291,5 +291,5 @@ class TelemetryReplay:
 
 
 def timed_frames(content: bytes) -> Iterator[Chunk]:
-    """Frames of a telemetry log; what stands between them and is none comes as a chunk too."""
+    """Frames of a telemetry log; bytes between them come as chunks too."""
     return (Chunk(data, time, fresh=True) for data, time in frames_with_times(content))

@@ -38,7 +38,7 @@ def nmea(url: str, notify: Notify, config: Config, recorded: bool = False) -> Li
 
     Parameters
     ----------
-    recorded : a file, in which sentences arrive at the time that those before them tell
+    recorded : a file, in which sentences arrive at the time of those before them
 
     Raises
     ------
@@ -67,11 +67,11 @@ class NmeaDecoder:
         }
 
     def message(self, line: bytes, arrival: float) -> Message | None:
-        """What a sentence says.
+        """The readings of a sentence.
 
         Raises
         ------
-        Refused : it is none, or not whole
+        Refused : not a sentence, or not whole
         """
         kind, text = sentence_of(line)
         if kind not in self._read and kind not in ATTITUDES:

@@ -97,7 +97,7 @@ def _is_number(text: str) -> bool:
 
 
 def _time(table: Table, candidates: Mapping[str, Candidate], unnamed: Mapping[str, Array], out: Guesses) -> Candidate:
-    """The column of stamps, by its name, else one whose numbers go on.
+    """The column of stamps, by its name, else one whose numbers increase.
 
     Raises
     ------

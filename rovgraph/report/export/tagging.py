@@ -43,7 +43,7 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
     Parameters
     ----------
     table : any columns
-    column : of times, in seconds of the track's clock, or dates (UTC where they do not say) if that is Unix time
+    column : of times, in seconds of the track's clock, or dates (UTC without a stated zone) if that is Unix time
     offset : what is added to the table's times, to come to the track's [s]
 
     Raises

@@ -38,7 +38,7 @@ def write_kitti(track: Track, path: Path, options: ExportOptions) -> None:
 _KITTI = (ExportFormat("kitti", "KITTI poses", ".kitti.txt", write_kitti),)
 
 
-RATE = 100.0  # of records, unless told otherwise [Hz]
+RATE = 100.0  # of records, by default [Hz]
 NAMES = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
     "heading", "wander_angle", "x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate",

@@ -230,7 +230,7 @@ def _environment() -> Environment:
 
 @cache
 def _asset(name: str) -> Markup:
-    """A file of ours that goes into the page as it is."""
+    """A file of this package that goes into the page unchanged."""
     return Markup((files("rovgraph.report.pages") / "assets" / name).read_text(encoding="utf-8"))
 
 
