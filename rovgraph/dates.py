@@ -72,7 +72,7 @@ _ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}|\d{8}T\d{6}")
 
 @dataclass(frozen=True)
 class DateRules:
-    """What texts leave open.
+    """Rules for dates that texts leave open.
 
     Attributes
     ----------

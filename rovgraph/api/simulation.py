@@ -42,7 +42,7 @@ class SimulatedDive:
 
     @cached_property
     def log(self) -> Log:
-        """What the vehicle recorded; the log that `save` writes has fewer digits."""
+        """The vehicle's recording; the log that `save` writes has fewer digits."""
         return Log.from_frame(self.dive.log_frame, self.config, f"{self.scenario} {self.seed}")
 
     @property

@@ -77,7 +77,7 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
 
 
 def find_advice(numbers: Sequence[Statistic]) -> list[Alarm]:
-    """What could be stated better and is no evidence of error, the worst of each kind and sensor."""
+    """Advice on values that could be stated better, no evidence of error, the worst of each kind and sensor."""
     return [one for one in _worst(numbers) if one.severity == "advice"]
 
 

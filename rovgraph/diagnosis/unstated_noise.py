@@ -127,7 +127,7 @@ class UnstatedNoise:
 
     @property
     def remedy(self) -> str:
-        """What states it in a configuration."""
+        """The keys that state it in a configuration."""
         return f"state {self.key}: {_as_yaml(self.values)}"
 
     def as_dict(self) -> dict[str, Any]:

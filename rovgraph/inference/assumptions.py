@@ -68,7 +68,7 @@ def rests_on_doubtful_compass(initial: InitialConditions) -> bool:
 def unchecked(
     config: Config, sources: Collection[str], present: Collection[str], expected: Collection[str] = ()
 ) -> list[str]:
-    """What heading, distances and depth rest on where nothing checks them, a line each.
+    """Assumptions behind heading, distances and depth that no sensor checks, a line each.
 
     Parameters
     ----------

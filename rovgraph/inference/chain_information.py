@@ -268,7 +268,7 @@ def square_root(
     kept: int | None = None,
     diagonal: bool = False,
 ) -> SquareRoot:
-    """What an elimination of n keyframes of d components and a border of c leaves.
+    """Square-root information of n keyframes of d components and a border of c.
 
     Parameters
     ----------

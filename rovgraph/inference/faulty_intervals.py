@@ -96,7 +96,7 @@ class Partition(Protocol[Point, Step]):
 
 @dataclass
 class Searches:
-    """What was found in a dive, for other solutions of it as configured the same.
+    """Searches in a dive, kept for other solutions of it with the same configuration.
 
     A search depends on where it begins, which is an optimum. Optima with the same gates are the same one, from
     wherever they were found, so that what was found from one of them holds for the others.

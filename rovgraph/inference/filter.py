@@ -485,7 +485,7 @@ class FilterEngine:
         return replace(known, B=B, L=other.L)
 
     def changes_in(self, begin: float, end: float) -> list[str]:
-        """What of the calibration takes another value after one time and up to another [s]."""
+        """Calibration variables whose value changes after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
     def _changes(self, problem: Problem, k: int) -> list[str]:

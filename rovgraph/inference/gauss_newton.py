@@ -230,7 +230,7 @@ def _descend(
 
 
 def left_after(promised: float, decrease: float) -> float:
-    """What steps will still take off the cost after a whole one, from what it promised and what it did."""
+    """Remaining decrease of the cost after a whole step, from its predicted and its actual decrease."""
     if not 0.0 < promised < math.inf:
         return 0.0 if promised == 0.0 else math.inf
     bend = decrease / promised - 1.0
@@ -240,7 +240,7 @@ def left_after(promised: float, decrease: float) -> float:
 
 
 def whole_share(promised: float, decrease: float) -> float:
-    """Of a step that falls short, how many times it leads to the least cost: along a parabola of another curvature."""
+    """Factor of a step that falls short to the least cost, along a parabola of another curvature."""
     bend = decrease / promised - 1.0 if 0.0 < promised < math.inf else 0.0
     return 1.0 / (1.0 - min(max(bend, 0.0), MOST_BEND))
 

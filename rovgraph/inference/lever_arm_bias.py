@@ -32,7 +32,7 @@ BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: not the 
 
 @dataclass(frozen=True)
 class SpuriousInformation:
-    """What the rate's noise adds to the arm's three components along b, each by itself.
+    """Spurious information of the arm's three components along b from the rate's noise, each by itself.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class SpuriousInformation:
     score: Array
 
     def share(self, sd: Array) -> Array:
-        """Of the information of least squares with an sd [m], what is spurious."""
+        """Spurious share of the information of least squares with an sd [m]."""
         return self.information * sd**2
 
     def drawn(self, sd: Array) -> Array:
@@ -52,12 +52,12 @@ class SpuriousInformation:
         return np.asarray(np.abs(self.score) * sd**2)
 
     def sd(self, sd: Array) -> Array:
-        """What an sd of least squares [m] is in truth; infinite where what is left is worth little."""
+        """The true sd for an sd of least squares [m]; infinite where little information remains."""
         share = self.share(sd)
         return np.asarray(np.where(share < WORTHLESS, sd / (1.0 - np.minimum(share, WORTHLESS)), np.inf))
 
     def step(self, step: Array, sd: Array) -> Array:
-        """What a step of least squares with its sd is in truth [m]; only where `sd` is finite."""
+        """The corrected step for a step of least squares with its sd [m]; only where `sd` is finite."""
         return np.asarray((step + self.score * sd**2) / (1.0 - np.minimum(self.share(sd), WORTHLESS)))
 
 

@@ -37,14 +37,14 @@ STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves l
 
 
 def verdict(ratio: float) -> str:
-    """What an sd, as a part of the prior's, means."""
+    """Verdict on an sd, as a part of the prior's."""
     if ratio > UNOBSERVABLE_ABOVE:
         return UNOBSERVABLE
     return OBSERVABLE if ratio < OBSERVABLE_BELOW else WEAK
 
 
 def data_information(covariance: Array, prior_sd: Array) -> Array:
-    """What the data add to the prior, in units of its sd.
+    """Information that the data add to the prior, in units of its sd.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
 
 
 def shown(best: Optimum) -> list[str]:
-    """What is considered and the dive shows, so that it is better estimated."""
+    """Considered variables that the dive shows, so that they should be estimated."""
     if not best.unknowns.considered:
         return []
     relative = best.relative_sd()

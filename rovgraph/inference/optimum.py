@@ -21,7 +21,7 @@ OTHERS = 9  # components of `Knowledge.covariance` before those of the calibrati
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known at m keyframes, from all data up to each.
+    """Estimates of the calibration at m keyframes, from all data up to each.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Optimum(Protocol):
         ...
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
-        """What is known from the data up to each of some keyframes, increasing, the first beyond 0."""
+        """Estimates of the calibration from the data up to each of some keyframes, increasing, the first beyond 0."""
         ...
 
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:

@@ -108,7 +108,7 @@ class KeyframeRule(NamedTuple):
 
 
 class Streams(NamedTuple):
-    """What has come.
+    """Samples and events that have arrived.
 
     Attributes
     ----------

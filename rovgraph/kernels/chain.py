@@ -106,7 +106,7 @@ PENDING = 48  # rows that are folded into the border at a time
 
 
 class Walks(NamedTuple):
-    """What walks from keyframe to keyframe: ``weight (x_{k+1} - kept x_k) = r`` is white; shape (n - 1, walking)."""
+    """Random walks from keyframe to keyframe: ``weight (x_{k+1} - kept x_k) = r`` is white; shape (n - 1, walking)."""
 
     weight: Matrix
     kept: Matrix
@@ -129,7 +129,7 @@ class PlacedRows(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """What an elimination writes.
+    """Output of an elimination.
 
     Attributes
     ----------

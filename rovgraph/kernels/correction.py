@@ -550,7 +550,7 @@ class GivenRows(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """What `correct` writes.
+    """Output of `correct`.
 
     Attributes
     ----------

@@ -55,7 +55,7 @@ class Motions(NamedTuple):
 
 
 class Aiding(NamedTuple):
-    """What is measured at m epochs.
+    """Measurements at m epochs.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class LevelStart(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What is taken as known.
+    """Constants that are taken as known.
 
     Attributes
     ----------

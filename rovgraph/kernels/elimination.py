@@ -41,7 +41,7 @@ from rovgraph.kernels.weighting import loss_weight, robust_cost
 
 
 class DiveFactors(NamedTuple):
-    """What is constant of a dive of n keyframes.
+    """The constant part of a dive of n keyframes.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ Indices = NDArray[np.int64]
 
 
 class ErrorColumns(NamedTuple):
-    """What of the calibration is estimated, and what the instruments see.
+    """Columns of the estimated calibration, and the variables that instruments observe.
 
     Attributes
     ----------

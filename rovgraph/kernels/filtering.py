@@ -219,7 +219,7 @@ class Interval(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What `take_interval` writes beside the estimate at the end.
+    """Output of `take_interval` beside the estimate at the end.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ class Intervals(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What `filter_intervals` writes.
+    """Output of `filter_intervals`.
 
     Attributes
     ----------

@@ -36,7 +36,7 @@ SHORTEST_S = 1e-3  # for which a log counts where time is shared
 
 @dataclass(frozen=True)
 class ChainTask:
-    """What the first stage of a chain takes.
+    """Input of the first stage of a chain.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class EstimatorSpec:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an estimator on one log.
+    """Result of an estimator on one log.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ OTHER_LABELS = (
 
 @dataclass(frozen=True)
 class Observability:
-    """What a dive shows of its calibration; c scalar components that are estimated.
+    """Observability of the calibration in a dive; c scalar components that are estimated.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def joint_bits(information: Array) -> float:
 
 
 def observe(log: Log, config: Config, also: Sequence[str] = (), progress: Progress = no_progress) -> Observability:
-    """What a recorded dive shows of the calibration.
+    """Observability of the calibration in a recorded dive.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
 
 
 def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progress = no_progress) -> Observability:
-    """What a solved dive shows of the calibration.
+    """Observability of the calibration in a solved dive.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def directions(information: Array) -> Directions:
 
 
 def in_words(information: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> list[str]:
-    """What cannot be known, a sentence each; where all can be, the weakest direction.
+    """Unobservable directions, a sentence each; where all are observable, the weakest one.
 
     Parameters
     ----------

@@ -96,7 +96,7 @@ class SensorRates:
 
 @dataclass(frozen=True)
 class KnownComponents:
-    """What is known of some components already.
+    """Prior information on some components.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class KnownComponents:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a manoeuvre would show.
+    """Predicted observability of a manoeuvre.
 
     Attributes
     ----------
@@ -240,7 +240,7 @@ def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
 
 
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
-    """What a manoeuvre would show by itself."""
+    """Predicted observability of a manoeuvre by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
     own = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
     truth = Truth(

@@ -104,7 +104,7 @@ class Clocks:
     _base: _Clock | None = None
 
     def time(self, message: Message) -> float | None:
-        """Of a message's measurements [s]; None = not to be known, leave it out.
+        """Of a message's measurements [s]; None = unknown, leave it out.
 
         A message of a source without a clock is as old as the IMU's newest at its arrival.
 
@@ -137,7 +137,7 @@ class Clocks:
         return None if self.trust or self._base is None else host - self._base.delay.value
 
     def state(self) -> dict[str, Any]:
-        """What it has learnt of the clocks, as plain values."""
+        """State of the clocks, as plain values."""
         return {
             "base": None if self._base is None else self._base.name,
             "clocks": [

@@ -448,7 +448,7 @@ LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 
 @dataclass
 class Files:
-    """What is on disk of a run, so that a crash loses no more than a second.
+    """Files of a run, so that a crash loses no more than a second.
 
     Parameters
     ----------

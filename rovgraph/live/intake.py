@@ -192,7 +192,7 @@ class Startup:
 
     @property
     def expects(self) -> str:
-        """What has to come before the dive can begin, or be different."""
+        """Conditions for the dive to begin."""
         if self.waits_for:
             return self.waits_for
         if self._next is None:

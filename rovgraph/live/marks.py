@@ -158,7 +158,7 @@ def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
 
 @dataclass(frozen=True)
 class Command:
-    """Something that a person wants done."""
+    """A person's command."""
 
 
 @dataclass(frozen=True)

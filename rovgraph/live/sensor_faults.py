@@ -59,7 +59,7 @@ OCCASIONAL = {"place"}  # sensors that measure only when there is something to s
 
 @dataclass(frozen=True)
 class Screening:
-    """What to do with a measurement.
+    """Decision on a measurement.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ _time = attrgetter("time")
 
 @dataclass
 class Watch:
-    """What is remembered of one sensor.
+    """Recent measurements and state of one sensor.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class Watch:
         return np.frombuffer(self.values), self.equal, self.since, self.until
 
     def release(self) -> tuple[Measurement, ...]:
-        """What has waited; it waits no more."""
+        """The waiting measurements, which no longer wait."""
         waiting = tuple(self.same) if self.waits else ()
         self.waits, self.same = False, []
         return waiting
@@ -241,7 +241,7 @@ class Faults:
         return watch.waits and watch.asked == -np.inf
 
     def state(self) -> dict[str, dict[str, Any]]:
-        """What is remembered of sensors whose values may be held, as plain values and arrays."""
+        """State of sensors whose values may be held, as plain values and arrays."""
         return {
             sensor: {
                 "held": watch.held,

@@ -178,7 +178,7 @@ class FrozenStretch:
 
 @dataclass(frozen=True)
 class Company:
-    """What an exact zero is judged by.
+    """Neighbours by which an exact zero is judged.
 
     Attributes
     ----------

@@ -59,7 +59,7 @@ def unwrapped(count: Array, wrap: float) -> Array:
 
 
 def counter_range(before: float, after: float) -> float:
-    """What a counter has wrapped by between two stamps, as `COUNTERS` has it; 0 where it did not [s].
+    """Range of a counter that wrapped between two stamps, of `COUNTERS`; 0 where it did not [s].
 
     One step back does not prove a short counter: a late message causes it, too.
     """
@@ -172,7 +172,7 @@ def few_digits(values: Array) -> bool:
 def known_offset(
     own: tuple[float, float], other: tuple[float, float], cycle: float = 0.0
 ) -> tuple[float, str, bool] | None:
-    """What makes a clock's stamps meet those of another that shows Unix time, of all that clocks are usually off by.
+    """Offset, of the usual ones, that brings a clock's stamps to another's in Unix time.
 
     Parameters
     ----------

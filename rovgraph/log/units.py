@@ -111,7 +111,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Scale:
-    """What makes SI and radians of the numbers of a column: a factor, or a form of `FORMS`."""
+    """Conversion of a column's numbers to SI and radians: a factor, or a form of `FORMS`."""
 
     factor: float = 1.0
     form: str = ""
@@ -130,7 +130,7 @@ class Scale:
 
 
 def scales(units: Mapping[str, str], source: str) -> dict[str, Scale]:
-    """What makes SI and radians of each column that a unit was declared for.
+    """Conversions to SI and radians of each column that a unit was declared for.
 
     Parameters
     ----------

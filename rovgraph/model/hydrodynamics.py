@@ -84,7 +84,7 @@ class Hydrodynamics:
         return np.hstack([self.thruster_directions, moments]).T
 
     def force_and_moment(self, signals: Array) -> tuple[Array, Array]:
-        """What all thrusters together do, body axes (2.21), (2.22).
+        """Force and moment of all thrusters, body axes (2.21), (2.22).
 
         Parameters
         ----------

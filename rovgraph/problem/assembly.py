@@ -61,7 +61,7 @@ def assembly_of(
 
 
 class InsertResult(StrEnum):
-    """What became of a measurement."""
+    """Result of inserting a measurement."""
 
     IN = "taken"
     LATE = "later than the lag"

@@ -13,7 +13,7 @@ from rovgraph.model.gauss_markov import walked
 
 @dataclass(frozen=True)
 class CalibrationRoles:
-    """What of the calibration a dive's estimate holds.
+    """Roles of the calibration variables in a dive's estimate.
 
     Attributes
     ----------

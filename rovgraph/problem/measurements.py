@@ -414,6 +414,6 @@ LENGTH = 8192  # keyframes or measurements: their Jacobians by everything take a
 
 
 def pieces(begin: int, end: int) -> Iterator[slice]:
-    """What lies from ``begin`` to before ``end``, a piece after the other."""
+    """The rows from ``begin`` to before ``end``, a piece after the other."""
     for first in range(begin, end, LENGTH):
         yield slice(first, min(first + LENGTH, end))

@@ -62,7 +62,7 @@ INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly si
 
 @dataclass(frozen=True)
 class PreintegrationParams:
-    """What is believed of the IMU and of where it moves.
+    """Noise of the IMU, gravity and Earth rate for preintegration.
 
     Attributes
     ----------

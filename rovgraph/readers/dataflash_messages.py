@@ -115,7 +115,7 @@ class DataflashMessages:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a log holds.
+    """Contents of a log.
 
     Attributes
     ----------
@@ -353,7 +353,7 @@ def _dtype_in_memory(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def instances(rows: NDArray[Any]) -> NDArray[Any] | None:
-    """Of which instance rows of messages are, shape (n,); None where their format has no instances."""
+    """Instance of each row of messages, shape (n,); None where their format has no instances."""
     return next((rows[name] for name in INSTANCE if name in (rows.dtype.names or ())), None)
 
 

@@ -122,7 +122,7 @@ class Account:
     left: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def count(self, table: TextTable) -> None:
-        """What of a table was not read: rows, and columns that hold no measurement of a log."""
+        """Count the unread parts of a table: rows, and columns without a measurement of a log."""
         self.left.update({("rows", why): count for why, count in table.left.items()})
         self.left["columns", f"no measurement that a log has: {', '.join(table.others)[:120]}"] += len(table.others)
 
@@ -146,7 +146,7 @@ def name_and_unit(written: str) -> tuple[str, str]:
 def measured_of(
     path: Path, table: TextTable, sources: Sequence[InertialSource], time: Array, step: float | None, account: Account
 ) -> list[InertialMeasurement]:
-    """What the columns of a table hold.
+    """Measured quantities in the columns of a table.
 
     Parameters
     ----------

@@ -22,9 +22,7 @@ RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that b
 LARGEST_SD = 1e6  # of a measurement's own: larger ones add no information, and overflow
 NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 99.9, 99.99, 999 ...
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
-MOSTLY = (
-    0.5  # share of a sensor's sds, from which on they are placeholders; fewer belong to uninformative measurements
-)
+MOSTLY = 0.5  # share of a sensor's sds, from which on they are placeholders; fewer belong to uninformative measurements
 
 Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
 Frame = Literal["position", "velocity", "heading"]

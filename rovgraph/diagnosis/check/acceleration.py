@@ -69,7 +69,7 @@ class Search:
 
 @dataclass(frozen=True)
 class AccelerationFit:
-    """What makes the DVL agree with the IMU.
+    """Axes, time offset and mounting that make the DVL agree with the IMU.
 
     Attributes
     ----------

@@ -626,7 +626,7 @@ class IncrementalEstimator:
         return states_of(*self.engine.estimate())
 
     def filtered(self) -> Estimate:
-        """What was known of each keyframe when it was the newest."""
+        """The filtered estimate of each keyframe, from when it was the newest."""
         return self.history.estimate(self.problem, "filtered")
 
     def solve(self) -> Estimate:

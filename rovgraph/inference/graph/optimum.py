@@ -29,7 +29,7 @@ from rovgraph.problem.problem import Problem
 
 
 def knowledge(graph: DiveGraph, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
-    """What is known from the data up to each of some keyframes.
+    """Estimates of the calibration from the data up to each of some keyframes.
 
     Parameters
     ----------

@@ -320,7 +320,7 @@ class SphereFit:
 
 @dataclass(frozen=True)
 class MagnetometerCalibration:
-    """What a calibration found.
+    """Result of a magnetometer's calibration.
 
     Attributes
     ----------
@@ -367,7 +367,7 @@ class MagnetometerCalibration:
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader of the piece should know, a line each."""
+        """Remarks for a reader of the piece, a line each."""
         before, after = 100.0 * self.before.length_rms, 100.0 * self.after.length_rms
         fit = f"scatter of the field's length {before:.2f} % of it, now {after:.2f} %"
         return [f"magnetometer calibrated from {self.source}, method {self.method}", fit]

@@ -72,7 +72,7 @@ def believed(
     fix_sd_m: float | None,
     prior_deg: tuple[float, float],
 ) -> Config:
-    """What the estimator of a run is given; the simulator draws the errors of its compasses from it.
+    """The configuration for the estimator of a run; the simulator draws the errors of its compasses from it.
 
     Parameters
     ----------

@@ -164,7 +164,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Tables:
-    """What a study found; docs/studies.md describes the columns.
+    """Results of a study; docs/studies.md describes the columns.
 
     Attributes
     ----------

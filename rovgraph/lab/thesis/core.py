@@ -226,7 +226,7 @@ Index = int | NDArray[np.int64]  # of an epoch, or of one for each member of a b
 
 
 class Epochs:
-    """What is given at each epoch; those of several logs lie one after the other.
+    """Given values at each epoch; those of several logs lie one after the other.
 
     Parameters
     ----------

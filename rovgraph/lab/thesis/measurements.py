@@ -53,7 +53,7 @@ def reference_field(instrument: Instrument, beliefs: dict[str, Belief]) -> Array
 
 
 class ImuModel(Protocol):
-    """What the inertial unit measures.
+    """Measurement model of the inertial unit.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ HEADING = 3  # its place among x, y, z, heading
 
 @dataclass(frozen=True)
 class Ping:
-    """What came from the DVL at one time.
+    """The DVL's measurements at one time.
 
     Attributes
     ----------

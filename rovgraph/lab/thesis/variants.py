@@ -94,7 +94,7 @@ class Filter:
 
     @property
     def kind(self) -> "Filter":
-        """What it has in common with those that it can go in lock step with: all but name, headings and numbers."""
+        """Key shared by filters that can run in lock step: all but name, headings and numbers."""
         return replace(self, name="", section="", about="", magnetometer=False, compass=False, numbers=_ANY)
 
     def with_numbers(self, **numbers: Any) -> "Filter":

@@ -53,7 +53,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Preset:
-    """What is known of an instrument.
+    """Data sheet of an instrument.
 
     Attributes
     ----------

@@ -37,7 +37,7 @@ NAMELESS = "its numbers go on; its name does not say so"
 
 
 def guess_table(table: Table) -> Guesses:
-    """What the columns of a table may be.
+    """Guess the columns of a table.
 
     Raises
     ------

@@ -250,7 +250,7 @@ ORDER: tuple[Sureness, ...] = ("sure", "likely", "unsure")
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """What a column may be.
+    """Guess of a column.
 
     Attributes
     ----------
@@ -270,7 +270,7 @@ class ColumnGuess:
 
 @dataclass
 class Guesses:
-    """What the columns of a table may be.
+    """Guesses of the columns of a table.
 
     Attributes
     ----------
