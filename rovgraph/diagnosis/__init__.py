@@ -63,7 +63,7 @@ def statistics(evidence: Evidence) -> list[Statistic]:
 
 
 def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
-    """What is beyond its limits, the worst of each kind and sensor, causes before what comes of them.
+    """Figures beyond their limits, the worst of each kind and sensor, causes before consequences.
 
     Parameters
     ----------

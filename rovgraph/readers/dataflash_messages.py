@@ -316,7 +316,7 @@ class _Walk:
         return [n for n in self._wanted.get(form.name, ()) if n in form.multipliers]
 
     def contents(self, cut_off: int) -> Contents:
-        """All that was walked."""
+        """Contents of the bytes read so far."""
         places = {name: columns.pop(_PLACE).array() for name, columns in self._columns.items()}
         found = {
             name: DataflashMessages({n: column.array() for n, column in c.items()}) for name, c in self._columns.items()

@@ -134,7 +134,7 @@ class MotionSignals:
 
 
 def motion_of(log: Log) -> MotionSignals:
-    """What the sensors of a log show, each along its own axes."""
+    """Motion by the sensors of a log, each along its own axes."""
     signals = []
     inertial = inertial_motion(log, Config())
     if inertial is not None:
@@ -181,7 +181,7 @@ ARM_INFORMATION = np.array([0.0, 0.0, 0.0, *[ARM_SD**-2] * 3])
 
 @dataclass(frozen=True)
 class Sums:
-    """What is left unexplained at every lag.
+    """Sums of the unexplained squares at every lag.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class SignalPair(Protocol):
 
     @property
     def name(self) -> str:
-        """What is compared."""
+        """Name of the compared quantity."""
 
     @property
     def spans(self) -> tuple[Array, Array]:
@@ -225,10 +225,10 @@ class SignalPair(Protocol):
         """Every lag that leaves an overlap."""
 
     def observed(self, times: Array) -> tuple[Array, Array]:
-        """What clock A shows at its times (n,), NaN where not known: shape (n, m), and for `regressors`, (n, k)."""
+        """Values on clock A at its times (n,), NaN where not known: shape (n, m), and for `regressors`, (n, k)."""
 
     def regressors(self, shown: Array, others: Array) -> Array:
-        """What the parameters (p,) are multiplied by, at times of clock B, shape (n, m, p).
+        """Regressors, multiplied by the parameters (p,), at times of clock B, shape (n, m, p).
 
         Parameters
         ----------

@@ -249,7 +249,7 @@ class Gatherer:
             rows.append(row)
 
     def rows(self) -> dict[tuple[Sender, str, str], MavlinkRows]:
-        """All that was taken: sender, name of the message and sensor -> Rows."""
+        """All rows taken: sender, name of the message and sensor -> Rows."""
         return {key: _rows(*key, flat) for key, flat in self._flat.items()}
 
 

@@ -345,7 +345,7 @@ def timing(channel: Channel) -> dict[str, Any]:
 
 
 def notes(merged: Merged) -> list[str]:
-    """What a reader of the log should know, a sentence each."""
+    """Remarks for a reader of the log, a sentence each."""
     names, said = merged.names, []
     for each in merged.selected:
         frame = f", {each.channel.frame}" if each.channel.frame else ""

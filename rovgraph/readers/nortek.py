@@ -83,7 +83,7 @@ def water_channels(track: NortekTrack, name: str, clock: str) -> Iterator[Channe
 
 
 def beam_table(track: NortekTrack) -> dict[str, Array]:
-    """What each beam measured."""
+    """Measurements of each beam."""
     of_beams = {"velocity": track.beams, "distance": track.distance, "fom": track.merit}
     count = track.beams.shape[1]
     columns = {f"{name}_{k + 1}": values[:, k] for name, values in of_beams.items() for k in range(count)}

@@ -450,7 +450,7 @@ class _Bag:
             self._left[name, "damaged messages"] += 1
 
     def left(self) -> list[Left]:
-        """What was not taken."""
+        """Topics that were not taken."""
         return [Left(name, count, why) for (name, why), count in sorted(self._left.items()) if count]
 
 

@@ -95,7 +95,7 @@ def select(recordings: Sequence[Recording], choose: Mapping[str, str]) -> tuple[
 def require_used(
     recordings: Sequence[Recording], selected: Sequence[Selected], unused: Sequence[Unused], choose: Mapping[str, str]
 ) -> list[str]:
-    """What to warn of where two files have a sensor at the same time.
+    """Warnings where two files have a sensor at the same time.
 
     Raises
     ------
@@ -171,7 +171,7 @@ class _File:
     shift: float
 
     def added(self, clock: str, first: "_File") -> float | None:
-        """What makes stamps of a clock those of the same clock in another file [s]; None = they are not to be compared.
+        """Offset from stamps of a clock to those of the same clock in another file [s]; None = they are not to be compared.
 
         Offsets from Unix time that differ little were found twice of one clock, whose stamps are more exact.
         """

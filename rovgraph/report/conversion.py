@@ -146,7 +146,7 @@ def _commented(settings: Mapping[str, Any], sources: Mapping[str, str], above: s
 
 
 def conversion_tables(report: Mapping[str, Any]) -> list[Table]:
-    """What each file held, where every column came from, and how clocks were joined."""
+    """Tables of each file's contents, the origin of every column, and how clocks were joined."""
     return [_channels(report), *([_clocks(report)] if report["clocks"] else []), *_left(report)]
 
 
@@ -194,7 +194,7 @@ def _number(value: float | None) -> str:
 
 
 def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str], name: str = "") -> Table:
-    """What each column of a table may be; ``name`` distinguishes its file."""
+    """Table of the guesses for each column; ``name`` distinguishes its file."""
     table = _table(
         f"columns of {name}" if name else "columns of the file", "column", "field", "unit", "why", "how sure"
     )

@@ -41,7 +41,7 @@ def write_observability(folder: Path, seen: Observability, config: Config, about
 
 
 def observability_as_dict(seen: Observability) -> dict[str, Any]:
-    """What observability.json holds; matrices in the units of the program, radians for angles."""
+    """Content of observability.json; matrices in the units of the program, radians for angles."""
     weakest = directions(seen.information)
     components = {
         label: {
@@ -73,7 +73,7 @@ def observability_as_dict(seen: Observability) -> dict[str, Any]:
 
 
 def words(seen: Observability) -> list[str]:
-    """What cannot be known, a sentence each."""
+    """Unobservable directions, a sentence each."""
     return in_words(seen.information, seen.labels, [v.unit for v in seen.variables], seen.prior_sd)
 
 

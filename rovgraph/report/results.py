@@ -241,7 +241,7 @@ def summarise(
     seconds: Mapping[str, float],
     alarms: Sequence[Alarm] = (),
 ) -> dict[str, Any]:
-    """What summary.json holds: plain values, units in the key names, null for unknown."""
+    """Content of summary.json: plain values, units in the key names, null for unknown."""
     estimates = main_first(estimates)
     main = estimates[0]
     summary = {

@@ -51,7 +51,7 @@ def _earth_rate(config: Config) -> Array:
 
 
 def specific_force_and_rate(motion: Motion, config: Config) -> Array:
-    """What a perfect unit senses, in body axes.
+    """Measurements of a perfect unit, in body axes.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ STEPS = 50  # of a process, in its time constant
 
 @dataclass(frozen=True)
 class LastingErrors:
-    """What of the calibration changes with time.
+    """Errors that last, of calibration variables.
 
     Attributes
     ----------

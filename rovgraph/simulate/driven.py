@@ -60,7 +60,7 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Craft:
-    """What a pilot sees of the vehicle.
+    """Motion of the vehicle as a pilot sees it.
 
     Attributes
     ----------

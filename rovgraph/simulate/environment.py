@@ -83,7 +83,7 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Magnetism:
-    """What is magnetic beside the calibration variables.
+    """Magnetic disturbances beside the calibration variables.
 
     Attributes
     ----------

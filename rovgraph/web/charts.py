@@ -40,7 +40,7 @@ class Chart(ABC):
 
     @abstractmethod
     def placed(self, place: Place) -> dict[str, Any]:
-        """What a page needs to draw it."""
+        """Data for a page to draw it."""
 
 
 class ImageChart(Chart):

@@ -49,7 +49,7 @@ class ListenAddress:
 
     @property
     def url(self) -> str:
-        """What a person opens, on this computer."""
+        """URL for a person on this computer."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}/"
 

@@ -92,7 +92,7 @@ class LivePage:
 
     @property
     def url(self) -> str:
-        """What a person opens; a token stands behind ``#``, which browsers keep to themselves."""
+        """URL for a person; a token follows ``#``, which browsers do not send."""
         return self.address.url if self.token is None else f"{self.address.url}#token={self.token}"
 
     def send(self, solution: Solution) -> None:

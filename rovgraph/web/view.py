@@ -119,7 +119,7 @@ class PageLimits:
 
 @dataclass(frozen=True)
 class Cursor:
-    """What a page has: points of an edition of the track, events, and an edition of the marks, -1 = none."""
+    """State of a page: points of an edition of the track, events, and an edition of the marks, -1 = none."""
 
     edition: int
     points: int

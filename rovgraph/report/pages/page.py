@@ -92,7 +92,7 @@ class Panel:
     reach: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """What ``page.js`` draws."""
+        """Data for ``page.js``."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
         more = {"log": self.log, "names": [*self.names], "reach": self.reach}
