@@ -171,7 +171,7 @@ class _File:
     shift: float
 
     def added(self, clock: str, first: "_File") -> float | None:
-        """Offset from stamps of a clock to those of the same clock in another file [s]; None = they are not to be compared.
+        """Offset of a clock against the same clock in another file [s]; None = they are not to be compared.
 
         Offsets from Unix time that differ little were found twice of one clock, whose stamps are more exact.
         """
