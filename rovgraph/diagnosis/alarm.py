@@ -11,7 +11,7 @@ Verdict = Literal["trusted", "doubtful", "wrong"]
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that healthy dives keep small, and its limits by the rule of its kind.
+    """A number that is small in healthy dives, and its limits by the rule of its kind.
 
     Attributes
     ----------

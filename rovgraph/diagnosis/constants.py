@@ -190,7 +190,7 @@ def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
 
 
 def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
-    """The Earth's rate against a gyro's bias that is claimed to ``sd`` [rad/s]."""
+    """The Earth's rate against a gyro's bias with an sd of ``sd`` [rad/s]."""
     return Statistic(
         "earth rate",
         "imu",

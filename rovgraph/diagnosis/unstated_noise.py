@@ -68,7 +68,7 @@ class DvlPlace:
 
 
 def estimate_lever_arm(best: ChainOptimum) -> DvlPlace | None:
-    """The place of a DVL that is considered, where it is another and no constant that is held is further off."""
+    """The place of a DVL whose arm is considered, where it is wrong and no held constant is further off."""
     if ARM not in best.unknowns.considered or _is_turned(best):
         return None
     belief, released = best.beliefs[ARM], score_test(best, RELEASED)
@@ -155,7 +155,7 @@ def find_noise(
 
 
 def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> tuple[list[UnstatedNoise], list[Rival]]:
-    """Errors that last, which stand out of white noise where that is known; and what explains the dive as clearly.
+    """Errors that last, which exceed white noise where that is known; and equally clear explanations.
 
     Parameters are those of `find_noise`.
     """
@@ -207,7 +207,7 @@ def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Ite
 
 
 def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:
-    """Whether it is a constant that is considered, and no larger than believed."""
+    """Whether it is a considered constant within its prior."""
     name = one.key.removeprefix("calibration.")
     if name not in best.unknowns.considered or "time_constant_s" in one.values or "mean" in one.values:
         return False

@@ -181,7 +181,7 @@ class Rival:
 def find_correlated_noise(
     best: ChainOptimum, without: Collection[str] = ()
 ) -> tuple[list[GaussMarkovError], list[Rival]]:
-    """Errors that last, the clearest first, each looked for beside those before it; and what else explains the dive.
+    """Errors that last, the clearest first, each sought beside those before it; and rival explanations.
 
     Parameters
     ----------
@@ -418,7 +418,7 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[GaussMarkovError]:
 
 
 def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
-    """How far a sensor's residuals go together for seconds: variance of sums over a time, 1 for independent noise.
+    """Correlation of a sensor's residuals over seconds: variance of sums over a time, 1 for independent noise.
 
     Parameters
     ----------

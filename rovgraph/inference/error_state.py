@@ -175,7 +175,7 @@ class FilterHistory:
         return x, c
 
     def _summary(self, problem: Problem) -> dict[str, Any]:
-        """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
+        """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as stated."""
         every = np.concatenate([np.empty(0), *(part.nis for part in self._met)])
         weight, nis = np.concatenate([np.empty(0), *(part.weight for part in self._met)]), {}
         for sensor in problem.used:

@@ -8,7 +8,7 @@ them, and the interval is fitted to give the least cost.
 An interval must cost less than as many single outliers, since it has one cause. It costs as much as the same number of
 good measurements may cost by chance:
 
-    J = cost of what is let in + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
+    J = cost of admitted measurements + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
 
 with n a sensor's measurements in its intervals, Q the quantile of chi-square beyond which one in a million lies, and s
 the mean square of normalised residuals of admitted measurements, at least 1. So an interval is excluded only where its

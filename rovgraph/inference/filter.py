@@ -252,7 +252,7 @@ def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> G
 
 
 class FilterEngine:
-    """Extended Kalman filter that keeps nothing: the estimate goes in and comes out.
+    """Extended Kalman filter without a state of its own: the estimate is argument and result.
 
     Parameters
     ----------
@@ -434,7 +434,7 @@ class FilterEngine:
         return np.concatenate(r), np.vstack(H)
 
     def considered_share(self, known: Gaussian, problem: Problem, row: int) -> Array:
-        """Variance that what is considered adds to an innovation, in units of the rest of it; shape (dim,).
+        """Variance of an innovation from considered variables, in units of the rest of it; shape (dim,).
 
         Gates and gains depend on P alone, so innovations of a consistent filter vary by as much more.
         """
@@ -477,7 +477,7 @@ class FilterEngine:
         return delta, basis
 
     def considering(self, known: Gaussian, other: Gaussian) -> Gaussian:
-        """An estimate in which all is exact that is considered, with the part that this has in another close by."""
+        """An estimate with considered variables exact, with their effect taken from another estimate close by."""
         size, (_, basis) = self.layout.size, self.local(known, other)
         ours, theirs, _ = common(known.places, other.places)
         B = np.zeros((len(known.P), len(other.L)))
@@ -489,11 +489,11 @@ class FilterEngine:
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
     def _changes(self, problem: Problem, k: int) -> list[str]:
-        """What of the calibration takes another value between keyframe k and the one before."""
+        """Calibration variables whose value changes between keyframe k and the one before."""
         return self.changes_in(float(problem.time[k - 1]), float(problem.time[k]))
 
     def _changed(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
-        """The keyframe before keyframe k, with the variance of what takes another value up to it."""
+        """The keyframe before keyframe k, with the variance of variables whose value changes up to it."""
         names = self._changes(problem, k)
         if not names:
             return known
@@ -566,7 +566,7 @@ class FilterEngine:
         return Gaussian(before.x, before.c, P, places, B, before.L)
 
     def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
-        """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
+        """The estimate corrected by given whitened rows of a place, and the weight of the measurement."""
         which, window = np.array([self._index[PLACE]]), np.full(1, -1)
         own = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
         interval = Interval(_NO_MOTION, _NO_COVARIANCE, _EXACT[:, 0], own, 0, r, H)

@@ -322,7 +322,7 @@ BOAT_ACC = 0.5  # noise density of a boat's acceleration: less takes its turns f
 
 
 def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple[Log, Config]:
-    """The log and the configuration with the motion that is reckoned with; without an IMU, with `ticks` in its place.
+    """The log and the configuration with its motion model resolved; without an IMU, with `ticks` in its place.
 
     Raises
     ------
@@ -391,7 +391,7 @@ def unseen(sensors: Collection[str]) -> list[str]:
 
 
 def _needs_imu(log: Log, config: Config, priors: dict[str, Belief]) -> list[tuple[bool, str]]:
-    """What needs an IMU: whether it is asked for, and the key that asks."""
+    """Features that need an IMU: whether each is requested, and by which key."""
     estimated = [
         name for name in (*SCALES, *(n for n in priors if n.endswith("_time_offset"))) if priors[name].estimate
     ]
@@ -545,7 +545,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
 
 
 def sample_density(time: Array, samples: Array) -> float:
-    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
+    """Noise density that samples show by themselves, robust against knocks [unit/rtHz].
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ SPURIOUSLY_OBSERVABLE = (
 )  # by noise: multiplied by the velocity in what is measured
 DOUBTFUL_ABOVE = 0.15  # an sd of these below it is not noise: half an hour straight ahead takes it to 0.43
 
-STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves little
+STILL = 0.95  # of the prior's sd: above it noise has little effect
 
 
 def verdict(ratio: float) -> str:

@@ -107,7 +107,7 @@ class Optimum(Protocol):
         ...
 
     def relative_sd(self) -> dict[str, Array]:
-        """The sd of what is considered, were it estimated, as a part of the prior's: name -> ndarray, shape (dim,)."""
+        """The sd of considered variables if estimated, as a part of the prior's: name -> ndarray, shape (dim,)."""
         ...
 
     def estimating(self, names: Sequence[str]) -> "Optimum":

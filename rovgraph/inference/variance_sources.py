@@ -102,7 +102,7 @@ def _by_held(root: SquareRoot, keyframe: int, held: int) -> Array:
 
 
 def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, float]]:
-    """What the IMU's noise, priors and walks bring: their residuals are differenced along the step."""
+    """Shares of the IMU's noise, priors and walks: their residuals are differenced along the step."""
     ahead, behind = (chain.moved(point, step, sign * STEP / _size(step)) for sign in (1.0, -1.0))
     scale = (_size(step) / (2 * STEP)) ** 2
     out = [("imu", scale * _squares(chain.problem.motion_residuals(ahead) - chain.problem.motion_residuals(behind)))]

@@ -76,7 +76,7 @@ def _rms(values: pd.Series) -> float:
 
 
 def nees_band(runs: int) -> tuple[float, float]:
-    """Within which the mean NEES of two components lies with 95 %, over independent runs."""
+    """The 95 % band of the mean NEES of two components, over independent runs."""
     low, high = (2.0 * float(gammaincinv(runs, p)) / runs for p in ((1.0 - BAND) / 2.0, (1.0 + BAND) / 2.0))
     return low, high
 

@@ -191,7 +191,7 @@ def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[s
 
     Returns
     -------
-    Trajectory, and what was taken out, by the names of `Metrics`
+    Trajectory, and the turn and shift that were removed, by the names of `Metrics`
     """
     mean_e, mean_t = estimate.p_n[:, :2].mean(axis=0), truth.p_n[:, :2].mean(axis=0)
     e, t = estimate.p_n[:, :2] - mean_e, truth.p_n[:, :2] - mean_t

@@ -175,7 +175,7 @@ WORKERS_S = 30.0  # for the first worker to join it
 
 
 class Executor(Protocol):
-    """Calls a function with every task, elsewhere, and ``finished`` here with what came of each.
+    """Calls a function with every task, elsewhere, and ``finished`` here with the result of each.
 
     A task that raises, or whose process dies, is tried again; after `RETRIES` of that
     ``finished`` is given the error.
@@ -200,7 +200,7 @@ class Local:
             raise InputError(f"{self.jobs} jobs: at least 1 is expected")
 
     def each(self, function: Callable[[Task], Result], tasks: Sequence[Task], finished: Finished) -> None:
-        """As `Executor`: after a process was killed, what it may have had at hand goes first, each by itself."""
+        """As `Executor`: after a process was killed, the tasks that it may have had come first, each by itself."""
         jobs, failures = self.jobs or cores(), dict.fromkeys(range(len(tasks)), 0)  # of what is not finished yet
         work = _Work(function, tasks, finished, failures)
         while failures:
@@ -236,7 +236,7 @@ class _Work:
         return self._killed(sorted(lost)[:jobs]) if lost else []
 
     def _killed(self, at_hand: list[int]) -> list[int]:
-        """A pool takes tasks in their order, so the first of the lost ones were at hand."""
+        """A pool takes tasks in their order, so the first of the lost ones were running."""
         message = "a worker process was killed (out of memory?); its task is done again"
         warn(message)
         if len(at_hand) == 1:

@@ -309,7 +309,7 @@ def _parts(axis: Array) -> list[int]:
 
 
 def _combination(axis: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> str:
-    """What may change along an open direction, and what that leaves known."""
+    """Components that change along an open direction, and those that stay determined."""
     parts = _parts(axis)
     names, change = [labels[i] for i in parts], axis[parts] * prior_sd[parts]
     if len(parts) == 1:

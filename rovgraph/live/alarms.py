@@ -206,7 +206,7 @@ class LiveAlarms:
     def _look_at_lasting(
         self, engine: FilterEngine, time: float, samples: dict[str, list[tuple[Met, int, Array]]]
     ) -> Iterator[list[Statistic]]:
-        """What residuals of the last minute show, sensor by sensor; before the last one, what is known so far."""
+        """Statistics of the last minute's residuals, one sensor a step: until the last item the previous ones."""
         self._pieces.append({})
         begin, found = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces)), list[Statistic]()
         for sensor in [sensor for sensor in samples if sensor != PLACE]:

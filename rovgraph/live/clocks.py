@@ -133,7 +133,7 @@ class Clocks:
         return stamp + self._correction(clock, AGREE_S if message.latency is None else AGREE_SENT_S)
 
     def now(self, host: float) -> float | None:
-        """The estimator's time at a time of the host's clock; None before the IMU has been heard, and in a replay."""
+        """The estimator's time at a time of the host's clock; None before the first IMU sample, and in a replay."""
         return None if self.trust or self._base is None else host - self._base.delay.value
 
     def state(self) -> dict[str, Any]:

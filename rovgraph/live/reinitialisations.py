@@ -177,7 +177,7 @@ def _smoothed(
 def _shown(
     best: Optimum, initial: InitialConditions, before: list[Statistic], dvl_contradicted: bool
 ) -> list[Statistic]:
-    """What is held wrongly, or not stated, by the smoothed dive so far."""
+    """Constants at wrong values and unstated noise, by the smoothed dive so far."""
     begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     if end - begin < RULES["held"].from_s:
         return []

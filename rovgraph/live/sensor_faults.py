@@ -349,7 +349,7 @@ class Crosscheck:
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
     def add(self, m: Measurement) -> list[Event]:
-        """Take a measurement; what is known to be late or wrong from now on, with the configuration that mends it."""
+        """Take a measurement; returns new findings of late or wrong sensors, with the correcting configuration."""
         if m.sensor != "imu":
             self._newest.append(m)
             return []

@@ -168,7 +168,7 @@ class Session:
                 self.files.recorder.write(time, message.arrival, readings)
 
     def _obey(self, command: Command) -> None:
-        """Do what a person wants; before the first solution nothing is known that it could refer to."""
+        """Execute a person's command; before the first solution it has nothing to refer to."""
         navigator, at = self.navigator, self.solution
         if at is None:
             return
@@ -211,7 +211,7 @@ class Session:
 
 
 def _sds_apart(given: SetPosition, at: Solution) -> float:
-    """How far a place is from a solution, in units of what both are uncertain by."""
+    """Distance of a place from a solution, in units of their joint sd."""
     apart = np.array([given.north, given.east]) - at.position[:2]
     covariance = np.diag(at.position_sd[:2] ** 2 + given.sd**2)
     covariance[0, 1] = covariance[1, 0] = at.cov_north_east

@@ -165,11 +165,11 @@ class TimeOffsets:
         return self.assumed.get(self.variable.get(sensor, ""), 0.0)
 
     def lag(self, sensor: str) -> Array | None:
-        """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""
+        """Range of the time offset of a sensor, shape (K,) [s]; None where it is not estimated."""
         return self.lags.get(self.variable.get(sensor, ""))
 
     def assume(self, c: Array) -> None:
-        """Renew the assumption by a calibration vector, shape (C,), as far as it was reckoned with."""
+        """Renew the assumed time offsets by a calibration vector, shape (C,), within the assumed range."""
         for name, lag in self.lags.items():
             self.assumed[name] = float(np.clip(np.mean(c[LAYOUT[name]]), lag[0], lag[-1]))
 
@@ -178,7 +178,7 @@ class TimeOffsets:
         return max((float(np.abs(calibration[n] - self.assumed[n]).mean()) for n in self.lags), default=0.0)
 
     def centred(self, calibration: Mapping[str, Array], reach: float) -> "TimeOffsets":
-        """Offsets that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
+        """Time offsets near the estimate, shape (n, 1) or (1,) each, within ``reach`` [s]."""
         assumed = self.assumed | {name: float(np.mean(calibration[name])) for name in self.lags}
         lags = {name: around(assumed[name], reach + float(np.ptp(calibration[name]))) for name in self.lags}
         return TimeOffsets(self.variable, lags, assumed)

@@ -354,7 +354,7 @@ class Assembly:
 
     @property
     def problem(self) -> Problem:
-        """The keyframes so far; nothing of it is written again but by `truncate`."""
+        """The keyframes so far; only `truncate` changes what has been written."""
         d, n, m, w = self._dive, len(self), int(self._dive.counts[at.ROWS]), int(self._dive.counts[at.WINDOWS])
         scaled = int(self._rule.scaled)
         return Problem(
@@ -508,7 +508,7 @@ class Assembly:
 
     @property
     def _events(self) -> Array:
-        """What has come, in the order of time, shape (e, VALUES + 2 D)."""
+        """Events so far, in the order of time, shape (e, VALUES + 2 D)."""
         if self._waiting:
             new, begin = self._waiting, self._come
             self._waiting, self._come = [], begin + len(new)
@@ -583,7 +583,7 @@ class Assembly:
     # measurements and samples
 
     def _insert_before_others(self, m: Measurement, place: Place) -> bool:
-        """Put a measurement at its place among those that have come; False = it is there already."""
+        """Insert a measurement in the order of time; False = it is there already."""
         k = len(self._events)
         while k > 0 and self._place_of(k - 1) > place:
             k -= 1
@@ -623,7 +623,7 @@ class Assembly:
         return out
 
     def _place_of(self, k: int) -> Place:
-        """Order of what has come: by time, and the DVL's before others."""
+        """Order of events: by time, and the DVL's before others."""
         if k < 0:
             return NEVER
         stamp, sensor, name = self._listed[k, [at.STAMP, at.SENSOR, at.NAME]].tolist()

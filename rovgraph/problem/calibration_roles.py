@@ -64,7 +64,7 @@ class CalibrationRoles:
         return replace(self, walks={**self.walks, name: belief.walk}, considered=left, time_constants=lasting)
 
     def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
-        """How one that walks moves in a time: `rovgraph.model.gauss_markov.walked`."""
+        """Factor and added sd of one that walks, in a time: `rovgraph.model.gauss_markov.walked`."""
         return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)
 
 

@@ -41,7 +41,7 @@ def motion_model(config: Config, available: Collection[str]) -> str:
 
 
 def has_constant_velocity(config: Config) -> bool:
-    """Whether a dive is reckoned without an IMU, once `motion_model` is resolved."""
+    """Whether a dive is estimated without an IMU, once `motion_model` is resolved."""
     return config.motion.model == "constant_velocity"
 
 

@@ -246,7 +246,7 @@ def _step(
 
 UNKNOWN_ZONE_S = 1800.0  # sd of a clock that may show local time
 AGREE_S = 0.5  # stamps that motion contradicts by less stay: a sensor may be late by as much
-SYSTEMATIC_S = 0.06  # by motion 12 simulated dives of two minutes were 0.03 s off, rms, where it claims 0.01 s
+SYSTEMATIC_S = 0.06  # by motion 12 simulated dives of two minutes were 0.03 s off, rms, at an sd of 0.01 s
 SURE = 3.0  # standard deviations of a contradiction
 SINCE_2000 = 9.5e8  # Unix time before is that of a clock that was never set [s]
 ARRIVAL_WINDOW_S = 60.0  # over which the least delay of a transport is taken

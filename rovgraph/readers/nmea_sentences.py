@@ -126,7 +126,7 @@ def heading_of(sentence: Any) -> tuple[float, bool] | None:
 def attitude_of(text: str) -> tuple[clock_time | None, float | None, float | None, float | None] | None:
     """Of a sentence of `ATTITUDES` or `TILT`: its time of day, heading, pitch and roll [deg]; None where it has none.
 
-    Pitch is positive with the bow up, roll with starboard down. The True North's may be set to mils: then it says so
+    Pitch is positive with the bow up, roll with starboard down. The True North's may be set to mils, as it then states
     nowhere.
 
     Parameters

@@ -639,7 +639,7 @@ class IncrementalEstimator:
         return self._optimum()
 
     def _optimum(self) -> Optimum:
-        """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
+        """The dive so far, solved from iSAM2's estimate; a landmark beyond its gate there gets a place of its own."""
         states, problem = self.states(), self.problem.upto(self._count)
         given = self.initial, states, newest_calibration(states.calibration)
         seen = problem.of_sensor(PLACE)

@@ -72,7 +72,7 @@ def eliminate(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> tuple[g
 
 
 def noise_of_states(graph: DiveGraph, values: gtsam.Values, gates: Gates, seed: int = 1) -> gtsam.VectorValues:
-    """A draw of the error that the data's noise leaves in the states, calibration held.
+    """A draw of the states' error from their posterior, calibration held.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def noise_of_states(graph: DiveGraph, values: gtsam.Values, gates: Gates, seed: 
 
 
 def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Sequence[str]) -> dict[int, Array]:
-    """How the optimum of all else moves with calibration variables that are given.
+    """Derivative of the optimum of all else by given calibration variables.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ class GraphOptimum:
 
     @cached_property
     def _sensitivity(self) -> dict[int, Array]:
-        """Derivatives of the optimum by what is considered times its prior sd, by key, shape (dim, h)."""
+        """Derivatives of the optimum by considered variables times their prior sd, by key, shape (dim, h)."""
         moves = sensitivity(*self._wide, self.solution.gates, self.unknowns.considered)
         beliefs = [self.beliefs[name] for name in self.unknowns.considered]
         sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])

@@ -192,7 +192,7 @@ class Results:
         self.history = Ledger(folder / "history.csv", HISTORY_COLUMNS, ["cell", "run", "time_s"])
 
     def add(self, task: CellTask, result: Done | BaseException) -> None:
-        """Keep what came of a run; its own row comes last, so that a run with a row is whole."""
+        """Keep the results of a run; its own row comes last, so that a run with a row is complete."""
         if isinstance(result, BaseException):
             result = Done({**task.begun, "failure": in_one_line(result)}, [])
         self.history.add(result.history)

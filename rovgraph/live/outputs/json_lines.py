@@ -115,7 +115,7 @@ class StandardOutput(Output):
 
 
 def _written(descriptor: int, data: bytes) -> int:
-    """Bytes taken; waits also where somebody else made the file non-blocking."""
+    """Bytes taken; waits also where another process made the file non-blocking."""
     while True:
         try:
             return os.write(descriptor, data)
@@ -235,7 +235,7 @@ class _Reader:
 
 
 class UdpOutput(Output):
-    """One JSON line per datagram; whether anybody listens is not known.
+    """One JSON line per datagram; without knowing whether a reader listens.
 
     Raises
     ------

@@ -167,7 +167,7 @@ class UdpLink:
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
         with self._socket:
             while not stop.is_set():
-                # Windows reports a datagram of ours that nobody took as an error of the next read
+                # Windows reports an undelivered datagram as an error of the next read
                 with contextlib.suppress(TimeoutError, ConnectionError):
                     data = self._socket.recv(BLOCK)
                     yield Chunk(data + self._end, time.time(), fresh=True)
