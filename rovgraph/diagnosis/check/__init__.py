@@ -1,8 +1,8 @@
 """Checks of a log before an estimate: units, signs, axes, clocks, contradictions.
 
 `examine` runs every check of `CHECKS` and collects the findings; `warn` is for commands that then work with the log. A
-check takes a log and a configuration and yields findings, independently of other checks. Begin with `values` (one
-sensor by itself) and `agreement` (two sensors of one motion).
+check takes a log and a configuration and yields findings, independently of other checks. May import what
+`rovgraph.diagnosis` may. Begin with `values` (one sensor by itself) and `agreement` (two sensors of one motion).
 
 `plan` is a preview of the estimate: heading sources, keyframes, assumptions. `places` counts the sightings of each
 place, since a place seen once adds no information.
