@@ -1,8 +1,8 @@
 """Presets: instruments' data sheets as keys and values of the configuration.
 
 The YAML files beside this module hold them, a file per maker. A number is written as its data sheet states it, with
-its unit and its source; it is converted here. A value that no source states stays empty. May import what `rovgraph.model`
-may. Begin with `Preset`.
+its unit and its source; it is converted here. A value that no source states stays empty. May import what
+`rovgraph.model` may. Begin with `Preset`.
 """
 
 import difflib
