@@ -1,4 +1,4 @@
-"""rovgraph: where a small underwater vehicle was, and where it is.
+"""rovgraph: navigation of small underwater vehicles, after a dive and during it.
 
 This docstring is the contract for frames, units and names in the whole package.
 

@@ -1,11 +1,10 @@
 """Times as people write them, as seconds: dates, times of day, and the day numbers of other programs.
 
-pandas parses; what is decided here is the order of day and month, the zone, and the epoch of numbers. A date without a
-zone is in UTC unless `DateRules` state another zone. One that may mean two days is refused with both readings.
+pandas parses; this module decides the order of day and month, the zone, and the epoch of numbers. A date without a
+zone is in UTC unless `DateRules` state another zone. A date that may mean two days is refused with both readings.
 
-GPS time, weeks and seconds since 1980 without leap seconds, as Unix time, and back.
-
-Leap seconds are those of IERS Bulletin C; the last was that of 2017.
+GPS time, weeks and seconds since 1980 without leap seconds, is converted to Unix time and back. Leap seconds are those
+of IERS Bulletin C; the last was that of 2017.
 """
 
 import re
@@ -56,7 +55,7 @@ def is_week(week: ArrayLike) -> NDArray[np.bool_]:
 Order = Literal["dmy", "mdy"]
 
 DAY_S = 86400.0
-YEAR_FIRST = "write the year first, such as 2026-05-01 09:30"  # where nobody can state an order
+YEAR_FIRST = "write the year first, such as 2026-05-01 09:30"  # where the order cannot be stated
 # epoch of a program's numbers -> day of 1970 in it, and seconds of its unit
 LONGEST_STEP_S = 3600.0  # between rows of a table, that is likely
 EPOCHS = {"excel": (25569.0, DAY_S), "matlab": (719529.0, DAY_S), "labview": (2_082_844_800.0, 1.0)}
@@ -73,7 +72,7 @@ _ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}|\d{8}T\d{6}")
 
 @dataclass(frozen=True)
 class DateRules:
-    """What texts leave open.
+    """Rules for dates that texts leave open.
 
     Attributes
     ----------
@@ -90,7 +89,7 @@ class DateRules:
 
 
 def is_text(cells: "pd.Series[Any]") -> bool:
-    """Whether a column holds texts that are no numbers, as dates are."""
+    """Whether a column holds texts other than numbers, as dates are."""
     if cells.dtype.kind in "biufc":
         return False
     known = cells.dropna().astype(str).str.strip()
@@ -113,7 +112,7 @@ def seconds_of_texts(cells: "pd.Series[Any]", rules: DateRules, where: Callable[
 
     Raises
     ------
-    InputError : a text that is no time; a date that may mean two days
+    InputError : a text that is not a time; a date that may mean two days
 
     >>> seconds_of_texts(pd.Series(["01.05.2026 09:30:00,5"]), DateRules(), str)[0]
     array([1.7776278e+09])
@@ -265,7 +264,7 @@ def _order(
         return None
     if rules.order is not None:
         return rules.order
-    if (parts["sep"][rows] == ".").all():  # nobody writes the month first with points
+    if (parts["sep"][rows] == ".").all():  # with points the month is never first
         return "dmy"
     first, second = (parts[name][rows].astype(int).to_numpy() for name in "ab")
     orders: tuple[tuple[Order, Any], ...] = (("dmy", second), ("mdy", first))

@@ -1,4 +1,4 @@
-"""A whole dive: from a log and a configuration to its estimates."""
+"""A whole dive: from a log and a configuration to all its estimates and the verdict."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -71,7 +71,7 @@ class DiveEstimates:
 
     @cached_property
     def advice(self) -> list[Alarm]:
-        """What could be stated better, which is no evidence of error."""
+        """Advice on values that could be stated better, no evidence of error."""
         return find_advice(self.statistics)
 
     @property

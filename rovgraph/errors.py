@@ -47,7 +47,7 @@ def collected_warnings() -> Iterator[list[str]]:
 
 
 def kind_of(value: object) -> str:
-    """What an argument is, for "expected …, found …".
+    """The kind of an argument, for "expected …, found …".
 
     >>> kind_of(None), kind_of(5), kind_of({})
     ('None', 'an int', 'a dict')

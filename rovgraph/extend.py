@@ -1,4 +1,4 @@
-"""What a package of your own imports to add a sensor, a format to read, or a format to write.
+"""For packages of your own: the names to import to add a sensor, a format to read, or a format to write.
 
 docs/compatibility.md says how long the names below stay, as those of ``import rovgraph`` do; every other module is
 internal and may change with any release. docs/own-sensor.md, docs/formats.md and docs/export.md show their use.

@@ -1,11 +1,11 @@
-"""The rule book: what can be wrong with a dive, before its estimate, after it, and while it goes on.
+"""The rule book: limits and remedies of all that can be wrong with a dive, before, in and after its estimate.
 
 `RULES` are the figures of the verdict, with their limits and how often they err (docs/alarms.md prints it),
-`COMPARISONS` what two sensors show by their motion, in a log and live (docs/check.md). Where one question has several
+`COMPARISONS` those of two sensors by their motion, in a log and live (docs/check.md). Where one question has several
 numbers, they stand here beside each other, with the reason. `rovgraph.log.frozen.HOLDS` is the table of frozen sensors.
 
-A figure beyond ``doubtful`` or ``wrong`` is an alarm, and the worst alarm is the verdict. What is better than stated is
-advice: it is no evidence of error, and no part of the verdict.
+A figure beyond ``doubtful`` or ``wrong`` is an alarm, and the worst alarm is the verdict. A figure better than stated
+is advice: it is no evidence of error, and no part of the verdict.
 """
 
 from dataclasses import dataclass

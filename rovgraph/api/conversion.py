@@ -1,6 +1,6 @@
-"""Native files as one log: what ``rovgraph convert`` does, and `read_log` of anything but a single log.
+"""Native files as one log: the work of ``rovgraph convert``, and `read_log` of anything but a single log.
 
-A mapping of the columns of anyone's table: what ``rovgraph convert --guess`` proposes.
+`guess_columns` proposes a mapping for the columns of any table: ``rovgraph convert --guess``.
 """
 
 import json

@@ -1,10 +1,8 @@
-"""Many simulated dives, to see what can be known: what ``rovgraph study`` does.
+"""For researchers: the work of ``rovgraph study``, ``compare``, ``observe``, ``plan`` and ``calibrate``.
 
-Estimators against each other: what ``rovgraph compare`` does.
-
-Observability of the calibration: what ``rovgraph observe`` and ``rovgraph plan`` do.
-
-Calibrations from a log of their own: what ``rovgraph calibrate`` does.
+`study_misalignment` runs many simulated dives, `compare` sets estimators against each other, `observe` and `plan`
+examine the observability of the calibration, and `calibrate_magnetometer` and `calibrate_noise` make a piece of
+configuration from a log of their own.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""Logs for an estimate: reading with a configuration, checking, bridging of clock jumps."""
+"""Logs for an estimate: reading with a configuration, checking, correcting clock jumps."""
 
 import warnings
 from collections.abc import Mapping, Sequence

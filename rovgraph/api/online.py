@@ -1,9 +1,4 @@
-"""An estimate while data arrive: what ``rovgraph online`` does.
-
-The folder of a live run, before it and after.
-
-The live page: what ``rovgraph online --http`` opens.
-"""
+"""An estimate while data arrive: the work of ``rovgraph online``, its folder, and its live page (``--http``)."""
 
 import contextlib
 import json
@@ -192,7 +187,7 @@ class LiveRun:
         """
         try:
             yield from self._solve()
-        except GeneratorExit:  # whoever iterates has had enough
+        except GeneratorExit:  # the caller stops iterating
             self._summarise()
             raise
         self._summarise()

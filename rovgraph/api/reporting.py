@@ -1,4 +1,4 @@
-"""Pages of results folders: what ``rovgraph report`` does."""
+"""Pages of results folders: the work of ``rovgraph report``."""
 
 from pathlib import Path
 

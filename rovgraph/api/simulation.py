@@ -1,7 +1,4 @@
-"""A dive whose truth is known: what ``rovgraph simulate`` does.
-
-A first dive without a log of your own: what ``rovgraph demo`` does.
-"""
+"""Dives with known truth: the work of ``rovgraph simulate`` and ``rovgraph demo``."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,7 +42,7 @@ class SimulatedDive:
 
     @cached_property
     def log(self) -> Log:
-        """What the vehicle recorded; the log that `save` writes has fewer digits."""
+        """The vehicle's recording; the log that `save` writes has fewer digits."""
         return Log.from_frame(self.dive.log_frame, self.config, f"{self.scenario} {self.seed}")
 
     @property

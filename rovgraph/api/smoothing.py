@@ -1,4 +1,4 @@
-"""The track of a dive: what ``rovgraph smooth`` does."""
+"""The track of a dive: the work of ``rovgraph smooth``."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -89,12 +89,12 @@ class Result:
 
     @property
     def advice(self) -> Sequence[Alarm]:
-        """What could be stated better: no evidence of error, and no part of the verdict."""
+        """Advice on values that could be stated better: no evidence of error, and no part of the verdict."""
         return self.dive.advice
 
     @property
     def assumptions(self) -> Sequence[str]:
-        """What neither log nor configuration states, and how native files were read, a line each."""
+        """Assumptions beyond log and configuration, and how native files were read, a line each."""
         return (*self.log.notes, *self.dive.assumptions)
 
     @property

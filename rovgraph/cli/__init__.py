@@ -1,4 +1,6 @@
-"""The command line: thin commands, each with a library twin.
+"""The command line: thin commands, each a function of the API plus printing.
 
-Heavy imports sit inside the command bodies, so that ``rovgraph --help`` is instant.
+May import everything; nothing imports it. Begin with `app` (`main` registers the commands); each command stands in the
+module of its kind: `smooth`, `logs`, `online`, `report`, `lab`. Heavy imports sit inside the command bodies, so that
+``rovgraph --help`` is instant.
 """

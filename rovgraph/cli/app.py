@@ -81,7 +81,7 @@ def main() -> None:
             sys.stdout.flush()
     except InputError as error:
         _refuse(str(error))
-    except BrokenPipeError:  # whoever read has had enough, as ``head``
+    except BrokenPipeError:  # the reader has closed the pipe, as ``head`` does
         _silence()
         sys.exit(0)
     except OSError as error:

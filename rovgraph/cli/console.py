@@ -1,7 +1,4 @@
-"""Where commands print: the width of tables, and sentences that break between words.
-
-A progress bar on long work, on standard error and only where a person looks.
-"""
+"""The console: the width of tables, sentences broken between words, and a progress bar on a terminal."""
 
 import os
 import textwrap

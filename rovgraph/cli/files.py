@@ -82,5 +82,5 @@ def whose(texts: Sequence[str] | None) -> "str | dict[str, str]":
 
 
 def name_of(files: Sequence[Path]) -> str:
-    """What a results folder is called after: the first file without its suffixes."""
+    """The name for a results folder: the first file without its suffixes."""
     return files[0].name.split(".")[0]

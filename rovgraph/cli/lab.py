@@ -1,17 +1,4 @@
-"""``rovgraph simulate``: a dive whose truth is known.
-
-``rovgraph demo``: a first dive, without a log of your own.
-
-``rovgraph compare``: estimators against each other, on one log or on many simulated dives.
-
-``rovgraph observe``: what of the calibration can be known from a dive.
-
-``rovgraph plan``: what to drive to know the calibration.
-
-``rovgraph study``: many simulated dives, to see what can be known.
-
-``rovgraph calibrate``: calibrations from a log of their own.
-"""
+"""Commands for researchers: ``simulate``, ``demo``, ``compare``, ``observe``, ``plan``, ``study`` and ``calibrate``."""
 
 from enum import StrEnum
 from pathlib import Path

@@ -1,9 +1,4 @@
-"""``rovgraph check``: is this log sane?
-
-``rovgraph config``: the effective configuration, or all keys there are.
-
-``rovgraph convert``: native files as one log.
-"""
+"""Commands on logs: ``check``, ``config`` (the effective configuration, or all keys) and ``convert``."""
 
 import itertools
 import re

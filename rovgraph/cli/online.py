@@ -1,7 +1,4 @@
-"""``rovgraph online``: estimate while data arrive.
-
-What ends a command that would go on for ever.
-"""
+"""``rovgraph online``: estimate while data arrive, until a signal or a limit ends it."""
 
 import contextlib
 import signal

@@ -1,11 +1,4 @@
-"""``rovgraph evaluate``: how far a trajectory is from a reference.
-
-``rovgraph report``: the page of a results folder, or of several dives side by side.
-
-``rovgraph export``: a track as files that others open.
-
-``rovgraph tag``: where the vehicle was at the times of another table.
-"""
+"""Commands on results: ``evaluate``, ``report``, ``export`` and ``tag``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

@@ -1,9 +1,10 @@
-"""What can be wrong with a dive: rules before, after and during it, what is found, and the verdict.
+"""Finds what is wrong with a log (`check`) and with a dive: statistics, alarms and the verdict.
 
+May import `rovgraph.simulate`, `inference`, `problem`, `rules`, `log`, `sensors`, `model`, `kernels` and what is below.
 Begin with `rovgraph.rules`, the one table of limits. `STATISTICS` are the functions: each takes the `Evidence` of a
-dive and yields figures that healthy dives keep small (docs/alarms.md). What is beyond its limit is an `Alarm`; the
-worst of them is the verdict. `unstated_noise` finds what explains a dive better than its configuration. The package
-stands above the estimators, whose eliminations it asks for; `rovgraph.dive` and `rovgraph.live` use it.
+dive and yields figures that are small in healthy dives (docs/alarms.md). A figure beyond its limit is an `Alarm`; the
+worst of them is the verdict. `unstated_noise` finds noise and constants that explain a dive better than its
+configuration.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -62,7 +63,7 @@ def statistics(evidence: Evidence) -> list[Statistic]:
 
 
 def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
-    """What is beyond its limits, the worst of each kind and sensor, causes before what comes of them.
+    """Figures beyond their limits, the worst of each kind and sensor, causes before consequences.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
 
 
 def find_advice(numbers: Sequence[Statistic]) -> list[Alarm]:
-    """What could be stated better and is no evidence of error, the worst of each kind and sensor."""
+    """Advice on values that could be stated better, no evidence of error, the worst of each kind and sensor."""
     return [one for one in _worst(numbers) if one.severity == "advice"]
 
 

@@ -1,4 +1,4 @@
-"""Alarms, advice, and the verdict that alarms come to."""
+"""Alarms, advice, and the verdict that follows from them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ Verdict = Literal["trusted", "doubtful", "wrong"]
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that healthy dives keep small, and its limits by the rule of its kind.
+    """A number that is small in healthy dives, and its limits by the rule of its kind.
 
     Attributes
     ----------
@@ -19,7 +19,7 @@ class Statistic:
     sensor : what it is about: a stream of the log, "imu", or "dive"
     begin, end : the time that it is about [s]
     figure : the number
-    cause : what is so, with its figures
+    cause : what is wrong, with its figures
     remedy : what to do, naming a configuration key or a command
     factor : times the rule's limits
     chance : quantile of the figure's distribution in healthy dives, beyond which both limits lie

@@ -31,7 +31,7 @@ FEIGNED = {
     "mag_time_offset": 5e-3,
 }  # by errors in variables, however long the dive is
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
-SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
+SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may cause
 TIME_OFFSETS = tuple(name for name, variable in TABLE.items() if variable.time_offset)
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
@@ -179,9 +179,9 @@ def contradicted_constants_in(
 
 
 def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
-    """The Earth's rate, where it is not modelled, against what the estimate claims to know of the gyro's bias.
+    """The Earth's rate, where it is not modelled, against the estimate's sd of the gyro's bias.
 
-    It is a bias that turns with the vehicle. A gyro whose bias is known ten times better than that feels it.
+    It is a bias that turns with the vehicle. It matters where the gyro's bias is known ten times better than that.
     """
     history = evidence.main.history.get("gyr_bias")
     if history is None or evidence.initial.config.environment.earth_rotation:
@@ -190,7 +190,7 @@ def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
 
 
 def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
-    """The Earth's rate against a gyro's bias that is claimed to ``sd`` [rad/s]."""
+    """The Earth's rate against a gyro's bias with an sd of ``sd`` [rad/s]."""
     return Statistic(
         "earth rate",
         "imu",

@@ -1,4 +1,4 @@
-"""What alarms look at: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
+"""Evidence for alarms: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +33,7 @@ class SensorResiduals:
     normalised : ndarray, shape (n, k), innovations in units of their sd
     weight : ndarray, shape (n,), 0 where it was rejected
     shared : ndarray, shape (n, k), variance of an error that successive ones share and that is allowed for, in units
-        of their own; None = there is none
+        of their own; None = without one
     """
 
     sensor: str
@@ -54,7 +54,7 @@ class Evidence:
     estimates : smoothed, filtered or both
     problem : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
-    frozen : what was left out since it is none
+    frozen : measurements left out as invalid
     log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     left_out : (sensor, reason) -> count of measurements that never reached the graph

@@ -1,17 +1,16 @@
-"""Alarms on the motion: the IMU against everything else, and the smoothed track against the filtered one.
+"""Alarms on the motion: IMU against all other sensors, smoother against filter, and ambiguous optima.
 
-Alarms on the choice between optima: a sensor that was ignored for some time, and a choice that was close.
+An optimum is ambiguous where a sensor is excluded for some time, or where another optimum is nearly as likely.
 
-Why a DVL contradicts the IMU: axes that are swapped or turned round, or a clock that is off.
-
-Over a few seconds the IMU knows how the velocity changes. In body axes, with l the lever arm and T the time between
-two pings,
+`dvl_cause` finds why a DVL contradicts the IMU: axes that are swapped or turned round, or a clock that is off. Over a
+few seconds the IMU measures the change of velocity. In body axes, with l the lever arm and T the time between two
+pings,
 
     v_b(t) - R_b(t)b(t-T) v_b(t-T) = R_b(t)n (integral of R_nb f_b + g),  v_b = R_bs H z - w x l
 
 holds for the right signed permutation H of the DVL's axes and the right shift of its stamps. Only turns between the
-pings and the vertical enter, so it does not matter how wrong the heading is. But the estimate comes of the wrong DVL.
-The check of the log compares without an estimate, so its line is given where it finds something.
+pings and the vertical enter, so an error of the heading has no effect. But the estimate itself used the wrong DVL. The
+check of the log compares without an estimate, so its finding takes precedence.
 """
 
 from collections.abc import Iterator
@@ -36,7 +35,7 @@ from rovgraph.problem.measurements import Measurements
 from rovgraph.rules import CHANCE, CLIPPED, CONTRADICTED, RULES, SETTLED_S, remedy_of_lag
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
-IMU_S = 20.0  # over which errors of the IMU last that are no noise
+IMU_S = 20.0  # over which errors of the IMU last, unlike noise
 # of a motion's residual: what people call it, columns, and the signal behind it
 PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
 # a bias's history, columns of a motion's residual, what people call it, its unit, and how many of them make one
@@ -323,7 +322,7 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
 
 
 class _Compared:
-    """Pings a few seconds apart, and how the IMU says that the velocity changed between them.
+    """Pings a few seconds apart, and the change of velocity between them by the IMU.
 
     Parameters
     ----------

@@ -1,10 +1,8 @@
-"""Alarms on the measurements' residuals: rejected, too large, too small, and lasting in one direction.
+"""Alarms on residuals: rejected, too large, too small, correlated; and sensors that froze or contradict each other.
 
 Residuals of a smoother vary less than the noise, since each measurement has pulled the estimate towards itself:
 their covariance is I - H P H' in units of the noise. So the limits upwards are those of independent noise. Downwards
 only the filter's normalised innovations squared (NIS) can tell, whose expectation is the measurement's dimension.
-
-Alarms on the sensors themselves: those that froze, and pairs that contradict each other.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,8 +26,8 @@ ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
 IN_A_MINUTE = 1.5  # times as much
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
-REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are no fault, or have a rule
-LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
+REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are normal, or have a rule
+LASTING_S = (5.0, 20.0)  # over which errors last, unlike noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {
     "dvl": "dvl.velocity_sd_mps",
@@ -76,7 +74,7 @@ def _gives_up(out: NDArray[np.bool_]) -> bool:
 
 
 def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
-    """Share of rejected measurements in each of m windows, 0 where they are too few to tell, shape (m,).
+    """Share of rejected measurements in each of m windows, 0 where they are too few, shape (m,).
 
     Parameters
     ----------
@@ -331,7 +329,7 @@ OF_RESIDUALS = ("rejected", "too large", "lasting")
 
 
 def findings_of_check(evidence: Evidence) -> Iterator[Statistic]:
-    """What the check of the log says is wrong with the data, and neither the log's reader nor the estimate has mended.
+    """Errors in the data by the check of the log that neither the log's reader nor the estimate has corrected.
 
     A clock that was set is bridged, and late stamps are no matter where the offset is estimated.
     """
@@ -371,7 +369,7 @@ def frozen_for(sensor: str, first: float, last: float, seconds: float, times: in
 
 
 def no_attitude(evidence: Evidence) -> Iterator[Statistic]:
-    """Longest time without heading, and without tilt, in which nothing said what the DVL's pings mean."""
+    """Longest time without heading, and without tilt, in which the DVL's pings have no known direction."""
     for part in ("heading", "tilt"):
         gaps = [gap for gap in evidence.attitude_gaps if gap.part == part and gap.pings]
         if not gaps:

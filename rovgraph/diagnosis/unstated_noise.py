@@ -1,20 +1,18 @@
-"""Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
+"""Noise and DVL lever arm that the configuration does not state, found in the residuals.
 
-Both come back as `Beliefs`, with which the dive is solved again, filter and smoother alike. So does the place of a DVL
-that is elsewhere than believed, where the gyro's noise would move it if it were estimated. A constant that is held
-wrongly makes residuals that look like either, so where alarms name one nothing is found. Late stamps of the same sensor
-are a rival: an error that lasts must make the dive likelier than these do.
+Noise may be larger than stated, or errors may last. Both are returned as `Beliefs`, with which filter and smoother
+solve the dive again. A wrong constant makes residuals that look like either, so no noise is reported where alarms name
+a constant. Late stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
 
-The factor of white noise comes from differences of successive residuals, which errors that last leave alone:
+The factor of white noise comes from differences of successive residuals, which errors that last do not change:
 
     factor^2 = median |r_k+1 - r_k|^2 / (2 m)
 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
 
-The place of a DVL that is elsewhere than the configuration has it, by the vehicle's own rates.
-
-Where the gyro's noise would move the DVL's arm if it were estimated, it is considered, and stays at its mean however
-far off that is (`rovgraph.inference.lever_arm_bias`). The score test without that noise says where the DVL is instead.
+`estimate_lever_arm` finds the DVL's lever arm from the vehicle's own rates. Where the gyro's noise would bias the arm
+if it were estimated, the arm is considered and stays at its mean, however wrong (`rovgraph.inference.lever_arm_bias`).
+The score test without that noise gives the right one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -60,7 +58,7 @@ class DvlPlace:
 
     @property
     def cause(self) -> str:
-        """What is so, in words."""
+        """The finding, in words."""
         named = zip(TABLE[ARM].labels, self.offset.tolist(), strict=True)
         where = ", ".join(f"{label[-1]} {off:+.2g} m" for label, off in named if off)
         return (
@@ -70,7 +68,7 @@ class DvlPlace:
 
 
 def estimate_lever_arm(best: ChainOptimum) -> DvlPlace | None:
-    """The place of a DVL that is considered, where it is another and no constant that is held is further off."""
+    """The place of a DVL whose arm is considered, where it is wrong and no held constant is further off."""
     if ARM not in best.unknowns.considered or _is_turned(best):
         return None
     belief, released = best.beliefs[ARM], score_test(best, RELEASED)
@@ -95,7 +93,7 @@ def _is_turned(best: ChainOptimum) -> bool:
 
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
-ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
+ALONE = ("fix", "ahrs")  # sensors of which only a time offset can be held at a wrong value
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
 LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
@@ -111,7 +109,7 @@ class UnstatedNoise:
     sensor : log stream
     key : of the configuration, that holds it
     values : what stands there with it; numbers, or keys of the section and theirs
-    cause, done : what is so, and what is done about it
+    cause, done : the finding, and what is done about it
     beliefs : the same, for the dive to be solved again
     """
 
@@ -129,7 +127,7 @@ class UnstatedNoise:
 
     @property
     def remedy(self) -> str:
-        """What states it in a configuration."""
+        """The keys that state it in a configuration."""
         return f"state {self.key}: {_as_yaml(self.values)}"
 
     def as_dict(self) -> dict[str, Any]:
@@ -157,7 +155,7 @@ def find_noise(
 
 
 def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> tuple[list[UnstatedNoise], list[Rival]]:
-    """Errors that last, which stand out of white noise where that is known; and what explains the dive as clearly.
+    """Errors that last, which exceed white noise where that is known; and equally clear explanations.
 
     Parameters are those of `find_noise`.
     """
@@ -201,7 +199,7 @@ def _placed(best: ChainOptimum, place: DvlPlace) -> UnstatedNoise:
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Iterator[Statistic]:
-    """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
+    """The same as alarms, of an estimate that does not use it; parameters are those of `find_noise`."""
     begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     for one in find_noise(best, config, alarms, UNLIKELY)[0] or find_errors(best, config, alarms)[0]:
         if not _is_allowed_for(one, best):
@@ -209,7 +207,7 @@ def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Ite
 
 
 def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:
-    """Whether it is a constant that is considered, and no larger than believed."""
+    """Whether it is a considered constant within its prior."""
     name = one.key.removeprefix("calibration.")
     if name not in best.unknowns.considered or "time_constant_s" in one.values or "mean" in one.values:
         return False
@@ -252,7 +250,7 @@ def noise_factor(r: Array) -> float | None:
 
 
 def _is_stated(best: ChainOptimum, sensor: str) -> bool:
-    """Whether a sensor's noise is the configuration's, and not what the log says of most measurements."""
+    """Whether a sensor's noise is the configuration's, and not the log's own of most measurements."""
     believed = best.chain.initial.instruments[sensor].sd
     dim = best.blocks[sensor].instrument.model.dim
     sd = best.problem.sd(best.problem.of_sensor(sensor), dim)

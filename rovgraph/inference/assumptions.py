@@ -1,10 +1,10 @@
-"""What no measurement of a dive can show to be wrong, and what it rests on instead.
+"""Assumptions that this dive's data cannot test.
 
 A dive that is turned as a whole about the vertical, or shifted along it, obeys the same equations: a constant error of
-the heading shows against position fixes only, one of the depth only against a start at a known depth. So does nearly a
-dive whose velocities have another scale: the accelerations of a small vehicle hardly show it.
+the heading shows against position fixes only, one of the depth only against a start at a known depth. The same nearly
+holds for a dive whose velocities have another scale: the accelerations of a small vehicle hardly show it.
 
-Where the heading rests on one compass, of which no calibration is stated, its prior is wide (`Variable.unchecked_sd`).
+Where the heading rests on one compass without a stated calibration, its prior is wide (`Variable.unchecked_sd`).
 """
 
 from collections.abc import Collection
@@ -21,11 +21,11 @@ PRESETS = {"mag": "imu", "ahrs": "imu", "dvl_heading": "dvl"}  # section of the 
 
 
 def unchecked_compass(config: Config, sources: Collection[str], present: Collection[str]) -> list[str]:
-    """Calibration variables of the compass that the heading rests on, if nobody calibrated it and nothing checks it.
+    """Calibration variables of the compass that the heading rests on, if it is neither calibrated nor checked.
 
     A calibration is an sd or a mean that is stated of one of them, an offset that is taken as exact, ``imu.mag``, or a
     preset of its instrument. It is checked by another compass, by position fixes, and by a stated heading at the start
-    that is known better. Fixes may still come online, but so far there are none.
+    that is known better. Fixes may still come online.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def unchecked_compass(config: Config, sources: Collection[str], present: Collect
 
 
 def _is_stated(config: Config, name: str) -> bool:
-    """Whether the configuration says what is known of a calibration variable."""
+    """Whether the configuration states a prior for a calibration variable."""
     variable, entry = TABLE[name], getattr(config.calibration, name)
     tail = "_deg" if variable.angular else ""
     known = getattr(entry, "sd" + tail) is not None or getattr(entry, "mean" + tail) is not None
@@ -68,7 +68,7 @@ def rests_on_doubtful_compass(initial: InitialConditions) -> bool:
 def unchecked(
     config: Config, sources: Collection[str], present: Collection[str], expected: Collection[str] = ()
 ) -> list[str]:
-    """What heading, distances and depth rest on where nothing checks them, a line each.
+    """Assumptions behind heading, distances and depth that no sensor checks, a line each.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Times without heading or tilt in a dive without an IMU.
 
-Without a gyro nobody knows which way the vehicle turned meanwhile. A ping gives the velocity along the vehicle's own
-axes, which says nothing of north and east once the heading may be anywhere: an error of heading that is not small
-shortens the way, too, and no covariance of a linearised estimate holds that. So a long gap is left to the motion of a
-silence (`rovgraph.kernels.motion`): pings in it are left out, and what else was measured is thinned until it leaves
-silences of that length.
+Without a gyro the turns of the vehicle in such a gap are unknown. A ping gives the velocity along the vehicle's own
+axes, which does not determine north and east once the heading may be anywhere: a large error of heading also shortens
+the way, and the covariance of a linearised estimate does not hold that. So a long gap is treated as an outage of all
+sensors (`rovgraph.kernels.motion`): pings in it are left out, and the other measurements are thinned until it leaves
+outages of that length.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class AttitudeGap:
 
 
 def without_attitude_gaps(log: Log, config: Config) -> tuple[Log, list[AttitudeGap]]:
-    """A log without what a dive without an IMU cannot use while it does not know its attitude, and those times.
+    """A log without the measurements in attitude gaps that a dive without an IMU cannot use, and the gaps.
 
     A log whose motion an IMU carries comes back as it is.
 

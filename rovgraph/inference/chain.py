@@ -1,10 +1,9 @@
 """The smoother of a dive that closes no loop: a chain of keyframes with a border of constants.
 
 Each iteration linearises all factors and eliminates them in the order of time, in one compiled pass
-(`rovgraph.kernels.elimination`). Calibration that walks is a part of each keyframe, what is constant is the border. The
-factors are those of the graph that `rovgraph.inference.graph` gives to GTSAM, and a test holds both optima equal.
-
-Where every variable of a chain stands: what walks in each keyframe's block, what is constant in the border.
+(`rovgraph.kernels.elimination`). Calibration that walks is a part of each keyframe's block, constants are the border:
+`ChainLayout` has the index of every variable. The factors are those of the graph that `rovgraph.inference.graph` gives
+to GTSAM, and a test holds both optima equal.
 """
 
 from collections import deque
@@ -115,7 +114,7 @@ class ChainLayout:
 
 
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
-PRIORS = 3  # rows at the first keyframe that are no measurements: two priors, and the tie of its clone
+PRIORS = 3  # rows at the first keyframe other than measurements: two priors, and the tie of its clone
 STIFF = 1e8  # square-root information that ties the clone to it [1/rad]
 
 NEWEST = 2  # points whose costs are kept: the last, and the one before it if that was better
@@ -197,7 +196,7 @@ class Chain:
 
     @cached_property
     def given(self) -> dict[str, Measurements]:
-        """The same of sensors whose equation no kernel knows."""
+        """The same of sensors without a kernel."""
         return self._blocks(self._unknown_to_kernels) if self._unknown_to_kernels else {}
 
     def _blocks(self, sensors: set[str]) -> dict[str, Measurements]:
@@ -214,7 +213,7 @@ class Chain:
 
     @cached_property
     def _places(self) -> dict[str, NDArray[np.int64]]:
-        """Sensor that kernels know -> places of its measurements among all."""
+        """Sensor with a kernel -> indices of its measurements among all."""
         names = [s for s in self.initial.instruments if s not in self._unknown_to_kernels]
         places = {name: self.problem.of_sensor(name) for name in names}
         return {name: found for name, found in places.items() if len(found)}
@@ -267,7 +266,7 @@ class Chain:
         return deque(maxlen=NEWEST)
 
     def _squared_lengths(self, point: State) -> Array:
-        """Of the whitened innovations of what kernels know, shape (m,)."""
+        """Of the whitened innovations of sensors with a kernel, shape (m,)."""
         out = np.empty(len(self.problem.rows))
         squared_lengths(self._factors, kernel_states(point), out)
         return out
@@ -286,7 +285,7 @@ class Chain:
         )
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
-        """Gates of what kernels know, shape (m,)."""
+        """Gates of sensors with a kernel, shape (m,)."""
         out = np.zeros(len(self.problem.rows), bool)
         for sensor, places in self._places.items():
             out[places] = gates[sensor]
@@ -404,7 +403,7 @@ class Chain:
         return self._room(CLONED)
 
     def _room(self, clones: int) -> MeasurementRows:
-        """Room for the rows of priors, of the clone's tie and of what no kernel knows, in this order."""
+        """Buffers for the rows of priors, of the clone's tie and of sensors without a kernel, in this order."""
         blocks, first = self.given.values(), np.zeros(1, np.int64)
         walking = self.layout.d - MOTION
         keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]

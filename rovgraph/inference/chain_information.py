@@ -1,11 +1,9 @@
-"""What whitened rows say of a chain of keyframes and a border of constants: `rovgraph.kernels.chain` and
-`rovgraph.kernels.chain_posterior` for callers.
+"""Square-root information of a chain of keyframes with a border of constants: solution, covariances, sensitivities.
 
-Right-hand sides are minus the residuals where a Gauss-Newton step is wanted. Variables of the border whose error is
-considered, not estimated (Schmidt), come last in it: `SquareRoot.solve` and `SquareRoot.border_covariance` take how
-many they are, or what is believed of them.
-
-Whitened rows of a chain that are at hand, eliminated: for studies of the solver.
+This is the interface to `rovgraph.kernels.chain` and `rovgraph.kernels.chain_posterior`. Right-hand sides are minus the
+residuals where a Gauss-Newton step is wanted. Considered variables (Schmidt) come last in the border:
+`SquareRoot.solve` and `SquareRoot.border_covariance` take their number, or their covariance. `eliminate` takes whitened
+rows that are given, for studies of the solver.
 """
 
 from collections.abc import Callable, Sequence
@@ -270,7 +268,7 @@ def square_root(
     kept: int | None = None,
     diagonal: bool = False,
 ) -> SquareRoot:
-    """What an elimination of n keyframes of d components and a border of c leaves.
+    """Square-root information of n keyframes of d components and a border of c.
 
     Parameters
     ----------
@@ -320,7 +318,7 @@ class MotionRows:
 
     @staticmethod
     def of_states(A_i: Array, A_j: Array, r: Array) -> "MotionRows":
-        """Rows of motions in which nothing walks and that know nothing of the border.
+        """Rows of motions without random walks and without columns of the border.
 
         Parameters
         ----------
@@ -341,7 +339,7 @@ def eliminate(
     ----------
     motions, measurements : the rows of n keyframes
     border_rows : ndarray, shape (p, c + 1), priors of the border with their right-hand sides
-    stops : increasing, keyframes at which to keep what the rows up to there say (`SquareRoot.filtered`)
+    stops : increasing, keyframes at which to keep the information of the rows so far (`SquareRoot.filtered`)
 
     Raises
     ------

@@ -1,9 +1,8 @@
-"""The optimum of a dive that closes no loop, as `rovgraph.inference.optimum` asks of any solver.
+"""The optimum of a dive without closed loops, with the interface of `rovgraph.inference.optimum`.
 
-A part of a chain that is solved by itself, with what was known before it as its prior.
-
-The keyframes before the part are eliminated at the point where the chain stands; what they say of the part's first
-keyframe and of the border stays as rows. What comes after the part is left out.
+`window` makes a part of a chain that is solved by itself. The keyframes before the part are eliminated at the point
+where the chain stands; their information about the part's first keyframe and the border stays as rows, its prior. The
+keyframes after the part are left out.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -63,7 +62,7 @@ class ChainWindow:
 
 
 def window(chain: Chain, solution: GaussNewtonResult[State], begin: float, end: float) -> ChainWindow | None:
-    """The keyframes between two times; None = they are half of the dive, or there are measurements no kernel knows.
+    """The keyframes between two times; None = they are half of the dive, or a sensor has no kernel.
 
     Parameters
     ----------
@@ -211,7 +210,7 @@ class ChainOptimum:
     def eliminated(self) -> SquareRoot:
         """All factors linearised and eliminated, what is considered last in the border; errors count from `state`.
 
-        Of a long dive there is no room for two: what was at hand is given away.
+        A long dive has no room for two: the caches are freed.
         """
         root = self.at_hand
         if root is None:
@@ -240,7 +239,7 @@ class ChainOptimum:
         return root.log_determinant(held), root.least(held)
 
     def rested(self) -> "ChainOptimum":
-        """The optimum a last step ahead, which the elimination yields that its covariances come of.
+        """The optimum after a final step, from the elimination that gives its covariances.
 
         Raises
         ------
@@ -262,7 +261,7 @@ class ChainOptimum:
         return ChainOptimum(self.chain, replace(again, iterations=known.iterations + again.iterations))
 
     def _last_step(self) -> "tuple[float, float, ChainStep, ChainOptimum | None]":
-        """What the step from here promises and yields, the step, and the optimum there if it is at rest."""
+        """Predicted and actual decrease of the step from here, the step, and the optimum there if it has converged."""
         root, held, known = self.eliminated(), len(self._believed), self.solution
         promised, (x, y) = root.explained(held), root.solve(held)
         step = ChainStep(x, y)
@@ -299,13 +298,13 @@ class ChainOptimum:
         return self.wide.moved(self.state, ChainStep(root.followed(y), y), 1.0)
 
     def sd_of_noise(self) -> dict[str, Array]:
-        """The sd of what is estimated and constant, were what is considered known: name -> ndarray, shape (dim,)."""
+        """The sd of estimated constants if all considered ones were known: name -> ndarray, shape (dim,)."""
         P, places = self._end.border_covariance(0.0 * self._believed), self.wide.layout.places
         border = [name for name in self.unknowns.estimated if places[name][0]]
         return {name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) for name in border}
 
     def moved_by_considered(self) -> Iterator[State]:
-        """The optimum with each component of what is considered one sd away, and all that is estimated along."""
+        """The optimum with each considered component one sd away, and the estimated variables following it."""
         root, held = self.eliminated(), len(self._believed)
         for k in range(held):
             y = np.zeros(len(root.border))

@@ -1,38 +1,37 @@
-"""Errors that last, found in a dive by its likelihood.
+"""Correlated noise of sensors, found in a dive by its likelihood.
 
-The configuration's noise is white. Here a sensor gets an error that lasts, too, a first-order Gauss-Markov process of
-some sd and time constant, and the likelihood says whether the dive is better explained with it. With whitened rows of
+The configuration's noise is white. Here a sensor also gets an error that lasts, a first-order Gauss-Markov process of
+some sd and time constant, and the likelihood tells whether it explains the dive better. With whitened rows of
 priors, motions, walks and measurements, and the square root R of their information, it is
 
     -log L = cost + sum log |diag R| - sum log (weights of walks and priors)
 
-which counts what the error's freedom costs (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. It
-sees the error through all that the estimate has followed of it, where the autocovariance of residuals would not: fixes
-that are off for a minute take the track along. One elimination at the optimum, with an error as large as the noise,
-tells whether to look for more; that is all that a healthy dive costs. The most likely sd and time constant are those of
-the dive linearised at its optimum, and the dive is solved once with them. Where it gains other than promised, it is
-linearised there for another search: fixes that were rejected without the error come back with it.
+which counts the error's additional freedom (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. The
+likelihood also shows the part of the error that the estimate has followed, which the autocovariance of residuals does
+not: fixes that are off for a minute pull the track with them.
 
-A constant that is off makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where one makes
-the dive likelier, it is found instead, as an error of infinite time constant.
+One elimination at the optimum, with an error as large as the noise, tells whether to search; a healthy dive costs no
+more. The most likely sd and time constant are those of the dive linearised at its optimum, and the dive is solved once
+with them. Where the gain differs from the predicted one, the dive is linearised there for another search: fixes that
+were rejected without the error are admitted with it.
 
-Likelihood alone takes whatever bends most. So each error has a largest sd, by what such an instrument can do: a
-receiver of 1 m is not 5 m off for minutes, a bed easily moves by 0.3 m/s. Explanations that are clear, each by itself,
-are rivals: how much likelier one is measures noise, not whether the right one is among them. Where they put the track
-elsewhere, a dive does not say which is right.
-
-An error may also take another value at once: a compass when a tool is carried, a depth that is zeroed, a receiver that
-switches its datum, a DVL that locks onto a hull. Jumps of a sensor's residuals propose when, those that were rejected
-included, and the likelihood of the dive with these steps then compares with that of an error that wanders.
-
-How much likelier a dive is with constants of another sd, as it is linearised: of any of them by one elimination.
-
-With all of them in its border, what is left of the elimination is the information and the score of the border from all
-measurements. Priors are added to it, what is held is left out, and with S, s of the rest
+A wrong constant makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where a constant
+makes the dive likelier, it is found instead, as an error of infinite time constant. One elimination with all constants
+in the border gives the likelihood of other sds of any of them: it leaves the information and the score of the border
+from all measurements. Priors are added to it, held constants are left out, and with S, s of the rest
 
     -2 log L = sum of the priors' squares - s' S^-1 s + log |S| + sum of log of the priors' variances
 
-up to what is the same for all (`rovgraph.inference.correlated_noise`).
+up to a term that is the same for all.
+
+The likelihood alone prefers the most flexible error. So each error has a largest sd, by the instrument: a receiver of
+1 m is not 5 m off for minutes, a moving bed easily reaches 0.3 m/s. Explanations that are each clear are rivals: the
+difference of their likelihoods measures noise, not whether the right one is among them. Where rivals give different
+tracks, the dive does not determine which is right.
+
+An error may also step: a compass when a tool is carried, a depth that is zeroed, a receiver that switches its datum, a
+DVL that locks onto a hull. Jumps of a sensor's residuals, rejected ones included, propose the times, and the likelihood
+of the dive with these steps is compared with that of a Gauss-Markov error.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -122,7 +121,7 @@ WORTH_A_LOOK = {
     "fix": 1.0,
     "depth": 0.4,  # healthy ones have at most 0.2, those with 3 cm of error that lasts 0.7
 }  # least `unity`; the track takes a DVL's error along
-CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
+CLEAR = 8.0  # gain beyond chance: of healthy dives one in a hundred reaches 6
 PART_OF_BEST = 0.25  # of the best explanation's gain, that a rival has: wrong ones had 0.46 of the right one's and more
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
 SMALLEST = 0.01  # sd, in that of the table
@@ -182,7 +181,7 @@ class Rival:
 def find_correlated_noise(
     best: ChainOptimum, without: Collection[str] = ()
 ) -> tuple[list[GaussMarkovError], list[Rival]]:
-    """Errors that last, the clearest first, each looked for beside those before it; and what else explains the dive.
+    """Errors that last, the clearest first, each sought beside those before it; and rival explanations.
 
     Parameters
     ----------
@@ -248,9 +247,9 @@ class _Baseline:
         return self._solved(wider, begin_at(wider, self.solution.point), self.solution)
 
     def reopened(self, chain: Chain, begin: State) -> "_Baseline":
-        """The dive as another chain from a point, all measurements let in to begin with.
+        """The dive as another chain from a point, all measurements admitted to begin with.
 
-        Without an error that is there the estimate may have bent away from good ones, which no gate lets in again.
+        Without the error the estimate may have moved away from good ones, which their gate then rejects for good.
         """
         return self._solved(chain, begin, replace(self.solution, gates=chain.initial_gates(), stretches=()))
 
@@ -299,8 +298,8 @@ def _steps(now: _Baseline, passed: Collection[str], beside: str = "") -> list[Ga
 def _jumps(block: Measurements, state: State, H: Array) -> tuple[tuple[float, Array], ...]:
     """When the residuals of a sensor jump, and by how much as an error; in the order of time.
 
-    Each measurement by itself says how large the error is. Medians of some seconds are compared with those after the
-    next: over so short a time the IMU knows the motion, however the estimate has bent to follow the sensor.
+    Each measurement by itself gives the error. Medians of some seconds are compared with those after the
+    next: over so short a time the IMU determines the motion, however far the estimate followed the sensor.
 
     Parameters
     ----------
@@ -356,7 +355,7 @@ def _with_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovErr
 def _fit_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovError, _Baseline]:
     """Steps with what they take off the cost, less their chances, and the dive with them.
 
-    Costs compare where other measurements are taken out, which determinants do not.
+    Costs compare where other measurements are excluded, which determinants do not.
     """
     stepped = now.with_steps(error.variable, error.sd, error.steps)
     path, time = stepped.solution.point.calibration[error.variable], now.chain.problem.time
@@ -373,9 +372,9 @@ def _fit_steps(now: _Baseline, error: GaussMarkovError) -> tuple[GaussMarkovErro
 
 
 def _reopened(now: _Baseline, passed: Collection[str]) -> list[tuple[GaussMarkovError, _Baseline]]:
-    """Errors of the table's size, each with all measurements let in to begin with, and the dives with them.
+    """Errors of the table's size, each with all measurements admitted to begin with, and the dives with them.
 
-    Costs compare where other measurements are let in, and what an error's freedom costs where they are the same.
+    Costs compare where other measurements are admitted; the likelihood where they are the same.
     """
     out, chain = [], now.chain
     plain = now.reopened(chain, now.solution.point)
@@ -419,11 +418,11 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[GaussMarkovError]:
 
 
 def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
-    """How far a sensor's residuals go together for seconds: variance of sums over a time, 1 for independent noise.
+    """Correlation of a sensor's residuals over seconds: variance of sums over a time, 1 for independent noise.
 
     Parameters
     ----------
-    block, state, gate : measurements, their keyframes' states, and which are let in
+    block, state, gate : measurements, their keyframes' states, and which are admitted
     H : ndarray, shape (n, dim, k), whitened Jacobian by what the residuals are looked at as
     """
     r = block.normalised(state)
@@ -431,7 +430,7 @@ def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) 
     score, information = np.einsum("nij,ni->nj", H, r), np.einsum("nij,nij->nj", H, H) * gate[:, None]
     window = ((block.time - block.time[0]) // WINDOW_S).astype(np.int64)
     sums = np.array([[np.bincount(window, column) for column in part.T] for part in (score, information)])
-    windows = sums[:, sums[1] > 0.0]  # windows without measurements that are let in say nothing
+    windows = sums[:, sums[1] > 0.0]  # windows without admitted measurements give no value
     if not windows.size:
         return 1.0
     return float(np.mean(windows[0] ** 2 / np.maximum(windows[1], 0.1 * np.median(windows[1]))))
@@ -499,7 +498,7 @@ def _as_constant(
 def _most_likely(now: _Baseline, begin: GaussMarkovError) -> GaussMarkovError:
     """The error of a sensor that makes the linear dive the most likely, or one that is implausible and more likely.
 
-    What the data tell best is how an error walks over short times, so that and the time constant are searched for: of
+    The data determine best how an error walks over short times, so that and the time constant are searched for: of
     sd and time constant the likelihood has a long ridge.
     """
     from scipy.optimize import minimize  # takes 0.1 s to load; healthy dives do not need it

@@ -1,9 +1,9 @@
 """Dead reckoning: gyro levelled by gravity and turned by a compass, DVL integrated.
 
-What a pilot has without an estimator, and the initial guess of one. The attitude is that of
-`rovgraph.kernels.dead_reckoning`, whose gains follow the believed noise. Calibration is held at its means, and every
-ping is believed that `graph` lets in, at its own time. Between pings velocity is linear in body axes; where there are
-none for longer it is that through the water, if that is measured, and the current of the pings around.
+A pilot without an estimator has this, and it is the smoother's initial guess. The attitude is that of
+`rovgraph.kernels.dead_reckoning`, whose gains follow the configured noise. Calibration is held at its means, and every
+ping that `graph` admits is used, at its own time. Between pings velocity is linear in body axes; in a longer gap it is
+the velocity through the water, if that is measured, plus the current of the pings around.
 """
 
 import math
@@ -28,9 +28,9 @@ from rovgraph.sensors import dvl_mounting
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
 KEEPS_HEADING_S = 20.0  # for so long what is fixed in the body is fixed in n
-PING_VALID_S = 2.0  # for so long a ping says how fast the vehicle is
+PING_VALID_S = 2.0  # for so long a ping's velocity is used
 HELD_SD = 0.3  # of the velocity that is held after that [m/s]
-CURRENT_S = 30.0  # of pings that tell the current
+CURRENT_S = 30.0  # of pings that determine the current
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def _attitudes(
 ) -> tuple[Array, Array]:
     """Attitude and bias at all epochs, shapes (m, 3, 3), (m, 6).
 
-    Tilt hardly depends on heading: it is found first, and with it what the compass says of heading.
+    Tilt hardly depends on heading: it is found first, and with it the compass's heading.
     """
     start, config, m = initial.prior, initial.config, len(epochs.time)
     bias, gyr_sd, env = start.state.bias[0], start.bias_sd[3:].max(), config.environment

@@ -1,12 +1,9 @@
-"""Error-state Kalman filter driven by the IMU, over a whole dive, and its smoother.
+"""The error-state Kalman filter over a whole dive, its history, and its smoother.
 
-`rovgraph.inference.filter` is the filter; here its steps are kept. Only the newest keyframe is corrected as
-measurements come. The smoother goes back over the filter's steps (Rauch, Tung and Striebel 1965) without linearising
-again.
-
-What a filter has found on its way through a dive, and the estimate that comes of it.
-
-A filter's newest keyframe as the smoother has it, from the whole of the dive so far.
+`ErrorStateFilter` runs `rovgraph.inference.filter` over a dive and keeps the steps as a `FilterHistory`, from which the
+estimate is made. Only the newest keyframe is corrected as measurements come. The smoother goes back over the filter's
+steps (Rauch, Tung and Striebel 1965) without linearising again. `reinitialised` puts the smoother's newest keyframe of
+the dive so far in place of the filter's.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -178,7 +175,7 @@ class FilterHistory:
         return x, c
 
     def _summary(self, problem: Problem) -> dict[str, Any]:
-        """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
+        """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as stated."""
         every = np.concatenate([np.empty(0), *(part.nis for part in self._met)])
         weight, nis = np.concatenate([np.empty(0), *(part.weight for part in self._met)]), {}
         for sensor in problem.used:
@@ -235,7 +232,7 @@ def reinitialised(engine: FilterEngine, problem: Problem, states: State) -> tupl
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:
-    """The places that were seen last, of those that anything says where they are."""
+    """The places that were seen last, of those with a determined position."""
     seen: dict[int, RememberedPlace] = {}
     problem, believed = best.problem, best.problem.believed
     for row in problem.of_sensor(PLACE).tolist() if best.places else ():
@@ -246,7 +243,7 @@ def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:
 
 
 # since the start, for `ErrorStateFilter.reinitialise_at`: while heading, mounting and compasses are known to
-# several degrees only, what was linearised once misstates what it knows by the square of that
+# several degrees only, a linearised covariance is wrong by the square of that
 REINITIALISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 PROGRESS_EVERY = 500  # keyframes
 
@@ -258,7 +255,7 @@ class ErrorStateFilter:
     Attributes
     ----------
     initial : of `rovgraph.inference.initialise.initialise`
-    reinitialise_at : times since the start at which the dive so far is smoothed, and the filter goes on from there [s]
+    reinitialise_at : times since the start at which the filter continues from the smoothed dive so far [s]
     learn_noise : of the IMU, from its newest samples
     problem : the dive, as far as it has been taken
     known : Gaussian of the newest keyframe, or what is believed before the first
@@ -285,7 +282,7 @@ class ErrorStateFilter:
         self._smoothed: State | None = None  # of the keyframes up to the newest reinitialisation
 
     def take(self, log: Log, progress: Callable[[float], None] = lambda done: None) -> None:
-        """Take a whole log, before anything else, and learn how late stamps are; ``progress`` is told 0 to 1."""
+        """Take a whole log, before anything else, and learn how late stamps are; ``progress`` receives 0 to 1."""
         self.assembly.take(log)
         begin, end = self.assembly.span
         while self._take(self.assembly.extend(one=True)):
@@ -321,7 +318,7 @@ class ErrorStateFilter:
         return self.known.state
 
     def step(self) -> FilterStep:
-        """Take the next interval: correct, predict, correct; now and then go on from the smoothed dive so far."""
+        """Take the next interval: correct, predict, correct; now and then continue from the smoothed dive so far."""
         smooths = not self.reinitialise_at
         done = self.engine.step(self.problem, len(self.history), self.known, self.gates, smooths)
         if smooths and done.departed is not None and done.transition is not None:
@@ -334,7 +331,7 @@ class ErrorStateFilter:
         return done
 
     def run(self, problem: Problem, progress: Callable[[float], None]) -> None:
-        """Take the keyframes of a dive, before anything else; ``progress`` is told 0 to 1 now and then."""
+        """Take the keyframes of a dive, before anything else; ``progress`` receives 0 to 1 now and then."""
         self.problem, n = problem, len(problem)
         compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in problem.sensors)
         while (k := len(self.history)) < n:
@@ -359,7 +356,7 @@ class ErrorStateFilter:
         return min(max(due, k + 1), len(time))
 
     def _reinitialise(self) -> None:
-        """Go on from the smoothed dive so far, where that is due."""
+        """Continue from the smoothed dive so far, where that is due."""
         n = len(self.history)
         if self._due and self.problem.time[n - 1] - self.problem.time[0] >= self._due[0]:
             self._due.pop(0)
@@ -398,7 +395,7 @@ def _back(engine: FilterEngine, departed: Gaussian, transition: Transition, foll
     """The smoothed state of a keyframe, given that of the one after it."""
     predicted, size = transition.predicted, engine.layout.size
     delta, basis = engine.local(predicted, following)
-    # of places, those that both know: one that was forgotten since moves with what it is correlated with
+    # of places, those in both: one that was forgotten since moves with its correlated components
     ours, theirs, shift = common(predicted.places, following.places)
     here, there = columns(size, ours), columns(size, theirs)
     delta, basis = np.concatenate([delta, shift]), extended(basis, len(here))

@@ -1,7 +1,4 @@
-"""What an estimator returns.
-
-From states and covariances at the IMU to an `Estimate` of the body's origin.
-"""
+"""The result of an estimator: `Estimate`, made from states and covariances at the IMU, for the body's origin."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -141,7 +138,7 @@ def body_trajectory(
 
 
 def second_order(cov_p_heading: Array) -> Array:
-    """What an error of the heading adds to the covariance of a position beyond its linear part, shape (n, 2, 2) [m^2].
+    """Second-order part of a heading error in the covariance of a position, shape (n, 2, 2) [m^2].
 
     An error theta that lasts the whole way turns it about the start, and what is d from there moves by
 

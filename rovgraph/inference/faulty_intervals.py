@@ -1,24 +1,25 @@
-"""Stretches in which a sensor is wrong all the time, found by the cost of leaving them out.
+"""Intervals in which a sensor is wrong all the time, found by the cost of leaving them out.
 
 Gates look at one measurement at a time. A DVL that is biased for half a minute moves the estimate with it, and its good
-pings before and after are rejected instead: an optimum of its own, from which no gate leads away. Rejections in a burst
-give it away. Then the measurements around the burst are taken out, one sensor's at a time, the dive is solved without
-them, and the stretch is fitted to what makes the dive cheapest.
+pings before and after are rejected instead: another local optimum, which gates do not leave. A burst of rejections
+reveals it. Then the measurements around the burst are excluded, one sensor's at a time, the dive is solved without
+them, and the interval is fitted to give the least cost.
 
-A stretch must not cost as many single outliers do, since it has one cause. It costs what as many good measurements
-cost, at the most that chance allows:
+An interval must cost less than as many single outliers, since it has one cause. It costs as much as the same number of
+good measurements may cost by chance:
 
-    J = cost of what is let in + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
+    J = cost of admitted measurements + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
 
-with n a sensor's measurements in its stretches, Q the quantile of chi-square beyond which one in a million lies, and s
-the mean square of normalised residuals of what is let in, at least 1. So a stretch is taken out only where its
-measurements cost more than good ones ever do, by the standard of the rest of the dive. A sensor that is wrong most of
-the time, or a dive that is no better without it, is not as configured: alarms say so, and nothing is taken out.
+with n a sensor's measurements in its intervals, Q the quantile of chi-square beyond which one in a million lies, and s
+the mean square of normalised residuals of admitted measurements, at least 1. So an interval is excluded only where its
+measurements cost more than good ones ever do, by the standard of the rest of the dive. Where a sensor is wrong most of
+the time, or the dive is no better without the interval, all measurements stay and alarms report it.
 
-The search frees what the dive holds and does not know exactly, such as the mounting of the DVL: a tilt that is held at
-zero makes all pings cost more than they should, so that leaving out more of them would always pay.
+The search frees constants that the dive holds and that are not exact, such as the mounting of the DVL: a tilt that is
+held at zero makes all pings cost more than they should, so that excluding more of them would always pay.
 
-It solves a dive some dozens of times. Of a long dive it solves the part around the burst, with what was known before.
+It solves a dive some dozens of times. Of a long dive it solves the part around the burst, with the information before
+it as prior.
 """
 
 import math
@@ -48,9 +49,9 @@ from rovgraph.inference.gauss_newton import (
 from rovgraph.rules import CHANCE, USUAL_SHARE
 
 BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and as many measurements
-SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
-AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with
-NOTICEABLE, CLEAR = 12.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
+SAME_CAUSE_S = 20.0  # bursts at most so far apart have one cause
+AROUND_S = (5.0, 20.0, 60.0)  # around a burst, excluded to begin with
+NOTICEABLE, CLEAR = 12.0, 100.0  # gain that may be chance; gain that is not chance
 OUTWARDS = (0, 2, 8, 16, 32, 64)  # measurements from what is clear
 SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
 GROWING = 5  # times what is beyond that, a slow error was there before it showed
@@ -95,7 +96,7 @@ class Partition(Protocol[Point, Step]):
 
 @dataclass
 class Searches:
-    """What was found in a dive, for other solutions of it as configured the same.
+    """Searches in a dive, kept for other solutions of it with the same configuration.
 
     A search depends on where it begins, which is an optimum. Optima with the same gates are the same one, from
     wherever they were found, so that what was found from one of them holds for the others.
@@ -136,8 +137,8 @@ def solve(
     Parameters
     ----------
     problem, point : the dive, and where to begin
-    freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
-        error that a mounting explains is no stretch's
+    freed : the dive, from where it is linearised, with the uncertain constants that ``problem`` holds estimated: an
+        error that a mounting explains needs no interval
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
     searches : that were made for other solutions of the same dive, as configured the same
     tolerance : as of `rovgraph.inference.gauss_newton.minimise`
@@ -222,7 +223,7 @@ def _without_stretch_in(
 def resume(
     problem: Linearizable[Point, Step], point: Point, known: GaussNewtonResult[Point], tolerance: float | None = None
 ) -> GaussNewtonResult[Point]:
-    """The optimum of a problem close to one whose solution is known, with the same stretches taken out."""
+    """The optimum of a problem close to one whose solution is known, with the same intervals excluded."""
     barred = _barred(problem.measured(), known.stretches)
     return _with_stretches(problem, minimise(problem, point, known.gates, barred, tolerance), known)
 
@@ -286,7 +287,7 @@ def _joined(windows: Sequence[tuple[float, float, float]]) -> list[tuple[float, 
 def _taken_out_around(
     problem: Linearizable[Point, Step], best: GaussNewtonResult[Point], burst: FaultyInterval, sensor: str
 ) -> GaussNewtonResult[Point] | None:
-    """The cheapest optimum without a sensor's measurements around a burst; None = there is none."""
+    """The cheapest optimum without a sensor's measurements around a burst; None = no such optimum."""
     wider = [FaultyInterval(sensor, burst.begin - more, burst.end + more) for more in AROUND_S]
     found = [_solved_without(problem, best, (*best.stretches, stretch)) for stretch in wider]
     return min(filter(None, found), key=lambda one: one.cost, default=None)

@@ -1,24 +1,18 @@
-"""The error-state Kalman filter: `FilterEngine.step` takes one interval, and is the only loop body there is.
+"""The error-state Kalman filter: `FilterEngine.step` takes one interval, offline and live.
 
-The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated. What
-is considered moves nothing; its part of the error goes along with the estimate (`Gaussian.B`).
-Motion, measurement equations, noise, losses, gates and prior are the smoother's own. What differs: every measurement
-is linearised once, where it comes.
+The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated
+(`ErrorLayout`). Considered variables receive no correction; their part of the error is carried with the estimate
+(`Gaussian.B`), and in Jacobians their columns follow those of the error. Motion, measurement equations, noise, losses,
+gates and prior are those of the smoother, with one difference: every measurement is linearised once, when it arrives.
 
-Per interval, the measurements between two keyframes correct the earlier one, as they do in the smoother; the state
-goes on to the next keyframe with the IMU; what was measured there corrects it.
+Per interval, the measurements between two keyframes correct the earlier one, as they do in the smoother; the IMU
+carries the state to the next keyframe; the measurements there correct it.
 
-Where to linearise an attitude that is hardly known, as after a silence of all sensors.
-
-A heading that may be off by half a right angle cannot be corrected along a tangent: a magnetic field
-that turns by forty degrees there grows by a fifth, which the filter would take for hard iron and
-tilt. So gravity and the compasses are looked at first, and the estimate is turned to where they fit.
-That is no measurement: the covariance stays, and they enter afterwards as they always do. It is what the
-iterated Kalman filter does (Bell and Cathey 1993), for the attitude alone, and begun where it can converge.
-
-Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated.
-
-In Jacobians, what is considered has columns behind those of the error.
+A poorly known attitude, as after a silence of all sensors, is first turned to where gravity and the compasses fit. A
+heading that may be off by half a right angle cannot be corrected along a tangent: a magnetic field that turns by forty
+degrees there grows by a fifth, which the filter would take for hard iron and tilt. The turn is not a measurement: the
+covariance stays, and gravity and compasses correct the filter afterwards as usual. It is an iterated Kalman filter
+(Bell and Cathey 1993), for the attitude alone, started where it can converge.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -258,7 +252,7 @@ def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> G
 
 
 class FilterEngine:
-    """Extended Kalman filter that keeps nothing: the estimate goes in and comes out.
+    """Extended Kalman filter without a state of its own: the estimate is argument and result.
 
     Parameters
     ----------
@@ -315,7 +309,7 @@ class FilterEngine:
         problem : the dive
         before : the keyframe before, or at the first `start`
         gates : renewed in place
-        wholly : tell the way to the keyframe, too
+        wholly : return the transition to the keyframe, too
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
         here, met = self._first_here(problem, k), Met.of(problem, k, len(before.c))
@@ -332,7 +326,7 @@ class FilterEngine:
         return FilterStep(filtered, met, departed, transition)
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
-        """Whether kernels know all of the interval that ends with keyframe k."""
+        """Whether kernels can take the whole interval that ends with keyframe k."""
         if k == 0 or before.places or poorly_known(before) or self._changes(problem, k):
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
@@ -381,7 +375,7 @@ class FilterEngine:
         return end - int(np.count_nonzero(problem.keyframe[begin:end] == k))
 
     def run(self, problem: Problem, begin: int, end: int, before: Gaussian, gates: FilterGates) -> FilterRun:
-        """Take intervals of a dive as `step` does, as far as kernels know how.
+        """Take intervals of a dive as `step` does, as far as kernels can.
 
         Parameters
         ----------
@@ -418,7 +412,7 @@ class FilterEngine:
     ) -> Gaussian:
         """The estimate corrected by measurements of its keyframe, places last; without gates all count.
 
-        ``met`` is told how they were met.
+        ``met`` receives how they were processed.
         """
         index = np.arange(some.start, some.stop)
         seen = problem.number[some] >= 0
@@ -440,7 +434,7 @@ class FilterEngine:
         return np.concatenate(r), np.vstack(H)
 
     def considered_share(self, known: Gaussian, problem: Problem, row: int) -> Array:
-        """Variance that what is considered adds to an innovation, in units of the rest of it; shape (dim,).
+        """Variance of an innovation from considered variables, in units of the rest of it; shape (dim,).
 
         Gates and gains depend on P alone, so innovations of a consistent filter vary by as much more.
         """
@@ -453,11 +447,11 @@ class FilterEngine:
         return np.asarray(np.sum(by_considered**2, axis=1) / (np.sum(own @ P * own, axis=1) + 1.0))
 
     def knows(self, sensor: str) -> bool:
-        """Whether the kernels know a sensor's equation."""
+        """Whether the kernels have a sensor's equation."""
         return sensor not in self._given
 
     def rows(self, problem: Problem, index: Index) -> KeyframeRows:
-        """Measurements of one keyframe that the kernels know."""
+        """Measurements of one keyframe whose equations the kernels have."""
         layout, measured = self.layout, problem.measured(index)
         return KeyframeRows(measured, self._model.sensors, layout.column, layout.width, self._gravity)
 
@@ -483,7 +477,7 @@ class FilterEngine:
         return delta, basis
 
     def considering(self, known: Gaussian, other: Gaussian) -> Gaussian:
-        """An estimate in which all is exact that is considered, with the part that this has in another close by."""
+        """An estimate with considered variables exact, with their effect taken from another estimate close by."""
         size, (_, basis) = self.layout.size, self.local(known, other)
         ours, theirs, _ = common(known.places, other.places)
         B = np.zeros((len(known.P), len(other.L)))
@@ -491,15 +485,15 @@ class FilterEngine:
         return replace(known, B=B, L=other.L)
 
     def changes_in(self, begin: float, end: float) -> list[str]:
-        """What of the calibration takes another value after one time and up to another [s]."""
+        """Calibration variables whose value changes after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
     def _changes(self, problem: Problem, k: int) -> list[str]:
-        """What of the calibration takes another value between keyframe k and the one before."""
+        """Calibration variables whose value changes between keyframe k and the one before."""
         return self.changes_in(float(problem.time[k - 1]), float(problem.time[k]))
 
     def _changed(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
-        """The keyframe before keyframe k, with the variance of what takes another value up to it."""
+        """The keyframe before keyframe k, with the variance of variables whose value changes up to it."""
         names = self._changes(problem, k)
         if not names:
             return known
@@ -541,7 +535,7 @@ class FilterEngine:
         gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
 
     def _of_model(self, known: Gaussian, problem: Problem, row: int) -> tuple[Array, Array]:
-        """The same of a sensor whose equation the kernels do not know."""
+        """The same of a sensor without a kernel."""
         state = known.state if problem.number[row] < 0 else known.state.seeing(ORIGIN)
         r, jacobians = self.measurements(problem, np.array([row])).linearize(state)
         return r[0], self.layout.matrix(jacobians)[0]
@@ -572,7 +566,7 @@ class FilterEngine:
         return Gaussian(before.x, before.c, P, places, B, before.L)
 
     def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
-        """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
+        """The estimate corrected by given whitened rows of a place, and the weight of the measurement."""
         which, window = np.array([self._index[PLACE]]), np.full(1, -1)
         own = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
         interval = Interval(_NO_MOTION, _NO_COVARIANCE, _EXACT[:, 0], own, 0, r, H)

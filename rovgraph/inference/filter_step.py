@@ -1,4 +1,4 @@
-"""What goes into an interval of the error-state filter, and what comes out."""
+"""Inputs and results of one interval of the error-state filter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -109,7 +109,7 @@ class Met:
     x, c : ndarray, shapes (m, 21), (m, C), the keyframe before each entered, as of `Gaussian`
     nis : ndarray, shape (m,), normalised innovation squared
     weight : ndarray, shape (m,), 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits
-        none of its name counts as rejected, and is remembered as another
+        no place of its name counts as rejected, and is remembered as another
     place : ndarray, shape (m, 2), where the place that is seen was believed to be, nan where none is
     number : ndarray of int, shape (m,), of the place that is seen, as the filter has it
     """

@@ -1,9 +1,8 @@
 """The error-state filter on data that arrive late and in any order, for missions without end.
 
-Measurements are held back for a moment, put in order, and then taken. One that comes later
-still is put where it belongs: the filter goes back to the keyframe before it and takes
-everything since once more. So the estimate does not depend on the order of arrival, as
-long as nothing is later than the lag; and nothing older than that is kept.
+Measurements are held back for a moment, put in order, and then processed. One that arrives later still is put where it
+belongs: the filter goes back to the keyframe before it and processes everything since again. So the estimate does not
+depend on the order of arrival, as long as no measurement is later than the lag; older data are dropped.
 """
 
 from collections import deque
@@ -70,7 +69,7 @@ class FixedLag:
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
     passed : called with each `FilterSnapshot` that the lag has passed, for good
     learn_noise : of the IMU, from its newest samples
-    keeps_all : of the dive, for whoever smooths it
+    keeps_all : keep the whole dive, for a smoother
     assembly : the dive, as far as it is kept
     """
 
@@ -101,7 +100,7 @@ class FixedLag:
         self._go_on(self.assembly.newest - self.hold_s)
 
     def adopt(self, index: int, known: Gaussian) -> bool:
-        """Go on from a better estimate of a keyframe, by the intervals since; False = the lag has passed it."""
+        """Continue from a better estimate of a keyframe, by the intervals since; False = the lag has passed it."""
         if not any(snapshot.index == index for snapshot in self.snapshots):
             return False
         later: list[FilterSnapshot] = []
@@ -115,7 +114,7 @@ class FixedLag:
         return True
 
     def adopt_passed(self, known: Gaussian, gates: FilterGates) -> None:
-        """Go on from a better estimate of the keyframe that the lag has passed last, by the intervals since.
+        """Continue from a better estimate of the keyframe that the lag has passed last, by the intervals since.
 
         Parameters
         ----------
@@ -137,7 +136,7 @@ class FixedLag:
         return snapshot.index - self.assembly.forgotten
 
     def continued(self, initial: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
-        """A filter that knows more sensors, or less of where it is, and goes on from here.
+        """A filter with more sensors, or a less certain position, that continues from here.
 
         Parameters
         ----------
@@ -157,12 +156,12 @@ class FixedLag:
         return other
 
     def oldest(self) -> FilterSnapshot:
-        """The oldest snapshot that the filter can go on from: the last of those that came at once."""
+        """The oldest snapshot that the filter can continue from: the last of those made at once."""
         ends = (a for a, b in pairwise(self.snapshots) if a.closed != b.closed)
         return next(ends, self.snapshots[-1])
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on elsewhere, as plain values and arrays; not before the first keyframe."""
+        """The state from which another can continue, as plain values and arrays; not before the first keyframe."""
         oldest = self.oldest()
         known = oldest.known
         return {
@@ -178,7 +177,7 @@ class FixedLag:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from where another stood."""
+        """Continue from the state of another."""
         index, _, bridged, closed = state["keyframe"]
         places = tuple(RememberedPlace(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         self.assembly.restore(state["assembly"])
@@ -229,7 +228,7 @@ class FixedLag:
         if unmade:
             self._gates = dict(self.snapshots[-1].gates) if self.snapshots else {}
             self.assembly.time_offsets.assume(self.snapshots[-1].known.c if self.snapshots else self.filter.start().c)
-        one = bool(self.assembly.time_offsets.lags)  # which are assumed anew after each keyframe
+        one = bool(self.assembly.time_offsets.lags)  # which are renewed after each keyframe
         while made := self.assembly.extend(until, one):
             self._step(made)
 
@@ -252,7 +251,7 @@ class FixedLag:
 
 
 def _taken_over(old: FilterEngine, new: FilterEngine, known: Gaussian) -> Gaussian:
-    """An estimate as a filter with more calibration has it: of what the other did not know, the prior."""
+    """An estimate with the additional calibration of another filter at its prior."""
     start, size = new.start(), (old.layout.size, new.layout.size)
     names = old.layout.columns
     at_old, at_new = (np.concatenate([np.r_[f.layout.columns[name]] for name in names]) for f in (old, new))

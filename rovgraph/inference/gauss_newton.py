@@ -3,15 +3,15 @@
 A Gauss-Newton step of a reweighted problem is a direction of descent of the robust cost. It is halved until the cost
 falls, so the iteration cannot diverge. Where the cost falls by more than the linear problem promises it is doubled as
 long as that helps: reweighted steps fall short where many measurements lie beyond their loss's bend. When it has
-converged, measurements beyond their gate are taken out, those back within it let in, and it is solved again until the
-gates rest. A measurement that is out costs what one at its gate costs: the robust cost is a truncated loss, of which
-optima with different gates compare.
+converged, measurements beyond their gate are excluded, those back within it admitted, and it is solved again until the
+gates stay the same. An excluded measurement costs as much as one at its gate: the robust cost is a truncated loss, by
+which optima with different gates compare.
 
-It has converged when the decrease that is left is small. A whole step that takes g off the cost where the linear
-problem promised p has bent the cost by b = g / p - 1 of what was promised: by weights that change, or by what is not
+It has converged when the remaining decrease is small. A whole step that lowers the cost by g, where the linear problem
+predicted p, differs from the prediction by b = g / p - 1 of it: because weights change, or because the problem is not
 linear. Along a parabola of another curvature, steps leave p b^2 / (1 - b). Steps that converge by a factor leave a
-geometric series of decreases, so two of them say what is left, too. A decrease of e is a move of sqrt(2 e) sd in the
-direction in which the data know least about it.
+geometric series of decreases, so two of them also give the rest. A decrease of e is a move of sqrt(2 e) sd in the
+direction that the data determine least.
 """
 
 import math
@@ -48,7 +48,7 @@ class GatedMeasurements:
     ----------
     time : ndarray, shape (n,) [s]
     dim : components of each
-    cost_at_gate : robust cost of one at its gate, infinite where there is none
+    cost_at_gate : robust cost of one at its gate, infinite without a gate
     """
 
     time: Array
@@ -64,7 +64,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def initial_gates(self) -> Gates:
-        """Which measurements are let in to begin with."""
+        """Which measurements are admitted to begin with."""
         ...
 
     def gates(self, point: Point) -> Gates:
@@ -72,7 +72,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def cost(self, point: Point, gates: Gates) -> float:
-        """The robust cost of what is let in, with that of priors and motions."""
+        """The robust cost of admitted measurements, priors and motions."""
         ...
 
     def step(self, point: Point, gates: Gates) -> Step:
@@ -109,11 +109,11 @@ class GaussNewtonResult(Generic[Point]):
     Attributes
     ----------
     point : where it lies
-    gates : sensor -> which measurements were let in
-    cost : robust cost, with that of the measurements that were not let in
+    gates : sensor -> which measurements were admitted
+    cost : robust cost, with that of the rejected measurements
     iterations : Gauss-Newton steps in all
     converged : the last cost no longer fell
-    stretches : taken out as a whole, of `rovgraph.inference.faulty_intervals`
+    stretches : intervals excluded as a whole, of `rovgraph.inference.faulty_intervals`
     runner_up : how much more the next best of the optima costs that were compared, infinite where there was one
     """
 
@@ -230,7 +230,7 @@ def _descend(
 
 
 def left_after(promised: float, decrease: float) -> float:
-    """What steps will still take off the cost after a whole one, from what it promised and what it did."""
+    """Remaining decrease of the cost after a whole step, from its predicted and its actual decrease."""
     if not 0.0 < promised < math.inf:
         return 0.0 if promised == 0.0 else math.inf
     bend = decrease / promised - 1.0
@@ -240,7 +240,7 @@ def left_after(promised: float, decrease: float) -> float:
 
 
 def whole_share(promised: float, decrease: float) -> float:
-    """Of a step that falls short, how many times it leads to the least cost: along a parabola of another curvature."""
+    """Factor of a step that falls short to the least cost, along a parabola of another curvature."""
     bend = decrease / promised - 1.0 if 0.0 < promised < math.inf else 0.0
     return 1.0 / (1.0 - min(max(bend, 0.0), MOST_BEND))
 

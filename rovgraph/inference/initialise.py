@@ -1,19 +1,13 @@
-"""Where a dive begins, and what the configuration leaves to the log.
+"""Initial conditions of a dive from its first seconds: attitude, heading, position, biases.
 
-Attitude comes from gravity (specific force averaged in the axes of the first sample)
-and heading from whatever the log has; the gyro's bias from standing still, where it
-stands still. An explicit ``start`` goes before all of it.
+Attitude comes from gravity (specific force averaged in the axes of the first sample), heading from the log's heading
+sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. An
+explicit ``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often
+wrong as any other, and here no gate would find it.
 
-What heading sources say of an attitude: by which angle about down it is to be turned.
-
-All of it through the instruments' own models, so it serves every source alike.
-
-What the first seconds of a log say: how it is levelled, whether it stands still, its heading, where it is.
-
-Nothing rests on a single sample: the first of a sensor is as often wrong as any other, and here
-no gate would find out.
-
-Whether a dive is reckoned without an IMU, and where it then begins.
+Each heading source gives the angle about down by which an attitude must be turned, through the instrument's own model,
+so one function serves all sources. `with_motion_model` decides whether a dive is estimated without an IMU, and where
+it then begins.
 """
 
 from collections.abc import Collection, Mapping
@@ -152,7 +146,7 @@ HEADINGS = 50  # samples of a source that are looked at
 UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
 FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
 AGREE_SD = 3.0  # of a fix with the line through those around it
-MOST_MPS = 1.0  # that a vehicle moves before anything says where it is
+MOST_MPS = 1.0  # speed of a vehicle before its first position
 
 
 class Level(NamedTuple):
@@ -177,7 +171,7 @@ class Level(NamedTuple):
 
 
 def level(log: Log, config: Config) -> Level:
-    """What the IMU says of the first seconds.
+    """The first seconds by the IMU.
 
     Parameters
     ----------
@@ -203,7 +197,7 @@ def level(log: Log, config: Config) -> Level:
 
 
 def _moves(log: Log) -> bool:
-    """Whether DVL or compass say so: a steady turn is as quiet as standing still."""
+    """Whether DVL or compass show motion: a steady turn is as quiet as standing still."""
     if "dvl" in log:
         ping = _opening(log["dvl"], log["imu"].time[0], WINDOW_S)
         speed = np.linalg.norm(ping.data[ping["dvl_valid"] == 1.0, :3], axis=1)
@@ -228,7 +222,7 @@ def first_heading(
 ) -> tuple[float, str]:
     """Yaw of the first epoch [rad], and the source that shows it.
 
-    Of what a source says in its first seconds, each sample brought back to the first epoch by the gyro, the
+    Of a source's samples in its first seconds, each brought back to the first epoch by the gyro, the
     one that the others are nearest to: the median on a circle.
 
     Parameters
@@ -241,7 +235,7 @@ def first_heading(
 
     Raises
     ------
-    InputError : no source speaks early enough
+    InputError : no source measures early enough
     """
     begin, means = log["imu"].time[0], {name: b.mean for name, b in beliefs(config).items()}
     for source in by_accuracy(config, sources):
@@ -328,7 +322,7 @@ BOAT_ACC = 0.5  # noise density of a boat's acceleration: less takes its turns f
 
 
 def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple[Log, Config]:
-    """The log and the configuration with the motion that is reckoned with; without an IMU, with `ticks` in its place.
+    """The log and the configuration with its motion model resolved; without an IMU, with `ticks` in its place.
 
     Raises
     ------
@@ -372,7 +366,7 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
 def _on_a_bed_that_may_move(log: Log, config: Config, assumptions: list[str]) -> Config:
     """A vehicle with neither IMU nor depth is a boat, and rivers move their beds: they are surveyed for that.
 
-    Nothing but position fixes would show it, so it is estimated unless the configuration says otherwise.
+    Only position fixes would show it, so it is estimated unless the configuration states otherwise.
     """
     if "depth" in log or "dvl" not in log or getattr(config.calibration, BOTTOM).estimate != AUTO:
         return config
@@ -397,7 +391,7 @@ def unseen(sensors: Collection[str]) -> list[str]:
 
 
 def _needs_imu(log: Log, config: Config, priors: dict[str, Belief]) -> list[tuple[bool, str]]:
-    """What needs an IMU: whether it is asked for, and the key that asks."""
+    """Features that need an IMU: whether each is requested, and by which key."""
     estimated = [
         name for name in (*SCALES, *(n for n in priors if n.endswith("_time_offset"))) if priors[name].estimate
     ]
@@ -419,7 +413,7 @@ def first_tilt(log: Log) -> tuple[float, float]:
 
 
 def no_bias() -> tuple[Array, Array]:
-    """Bias of the first keyframe and its sd, shapes (6,): there is none."""
+    """Bias of the first keyframe and its sd without an IMU: zeros, shapes (6,)."""
     return np.zeros(6), np.full(6, NO_BIAS_SD)
 
 
@@ -551,7 +545,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
 
 
 def sample_density(time: Array, samples: Array) -> float:
-    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
+    """Noise density that samples show by themselves, robust against knocks [unit/rtHz].
 
     Parameters
     ----------

@@ -5,10 +5,10 @@ derivative by the arm has e in it, and so has the innovation, as e x l. Least sq
 
     F = sum over pings of rate_sd^2 (tr(M) 1 - M),   M = R_bs (diag(sd^2) + G G' rate_sd^2)^-1 R_bs'
 
-as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the score - F l. Without both, what is left
-is what the vehicle's own rates show: the corrected score (Nakamura 1990). Of a vehicle that hardly rolls, with an IMU
-for autopilots, nothing is left of the arm's z, however long the dive is. Noise that the estimate follows is in no
-innovation, so M is taken less by the part of a ping's information that goes into its own prediction.
+as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the score - F l. Without both, the
+information of the vehicle's own rates remains: the corrected score (Nakamura 1990). For a vehicle that hardly rolls,
+with an IMU for autopilots, no information about the arm's z remains, however long the dive is. Noise that the estimate
+follows is not in the innovation, so M is reduced by the part of a ping's information that goes into its own prediction.
 """
 
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ MOST_DRAWN = 5.0  # sds, up to which it may be estimated: what is taken off is r
 MOST_DRAWN_UNCORRECTED = 1.0  # the same where nothing is taken off
 ROUNDS = 3  # each leaves of the score's error the share of spurious information
 MOST_FOLLOWED = 0.2  # part of a ping's information that goes into its own prediction
-BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: that is no noise of a gyro
+BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: not the noise of a gyro
 
 
 @dataclass(frozen=True)
 class SpuriousInformation:
-    """What the rate's noise adds to the arm's three components along b, each by itself.
+    """Spurious information of the arm's three components along b from the rate's noise, each by itself.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class SpuriousInformation:
     score: Array
 
     def share(self, sd: Array) -> Array:
-        """Of the information of least squares with an sd [m], what is spurious."""
+        """Spurious share of the information of least squares with an sd [m]."""
         return self.information * sd**2
 
     def drawn(self, sd: Array) -> Array:
@@ -52,17 +52,17 @@ class SpuriousInformation:
         return np.asarray(np.abs(self.score) * sd**2)
 
     def sd(self, sd: Array) -> Array:
-        """What an sd of least squares [m] is in truth; infinite where what is left is worth little."""
+        """The true sd for an sd of least squares [m]; infinite where little information remains."""
         share = self.share(sd)
         return np.asarray(np.where(share < WORTHLESS, sd / (1.0 - np.minimum(share, WORTHLESS)), np.inf))
 
     def step(self, step: Array, sd: Array) -> Array:
-        """What a step of least squares with its sd is in truth [m]; only where `sd` is finite."""
+        """The corrected step for a step of least squares with its sd [m]; only where `sd` is finite."""
         return np.asarray((step + self.score * sd**2) / (1.0 - np.minimum(self.share(sd), WORTHLESS)))
 
 
 def spurious_information(best: Optimum) -> SpuriousInformation:
-    """That of the arm in a dive, F and F l of above; of the measurements that are let in, with their weights."""
+    """F and F l of above in a dive, of the admitted measurements with their weights."""
     information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
     for sensor, block in best.blocks.items():
         model = block.instrument.model
@@ -95,7 +95,7 @@ def _followed(best: Optimum) -> Array:
 
 
 def noise_moves_arm(best: Optimum, sd: Array) -> bool:
-    """Whether too much of what least squares knows of the arm is spurious, of an sd of shape (3,) [m]."""
+    """Whether too much of least squares' information about the arm is spurious, of an sd of shape (3,) [m]."""
     spurious = spurious_information(best)
     most = MOST_DRAWN if isinstance(best, ChainOptimum) else MOST_DRAWN_UNCORRECTED
     return bool(((spurious.share(sd) > MOST) | (spurious.drawn(sd) > most * sd)).any())

@@ -1,15 +1,14 @@
-"""What a dive says of the calibration: information, and a verdict on every component.
+"""Observability of the calibration: the information that a dive adds, and a verdict on every component.
 
 Everything is in units of the prior's sd: with D the information that the data add, the
 covariance of the calibration is (1 + D)^-1 and an sd of 1 is the prior repeated.
 
-A graph is linearised where its noisy estimate lies. A velocity that is constant in truth
-trembles in the estimate, the graph takes the trembling for accelerations, and these seem to
-show the DVL's misalignment and scale: along a straight line it claims to know what cannot be
-known. What noise adds is found by adding as much again (simulation extrapolation; Cook and
-Stefanski 1994): noise of the states is drawn from the graph's own posterior, put onto the
-estimate with both signs, and what the information gains by that is taken off once. Noise of the gyro in the DVL's lever
-arm is taken off by its equation (`rovgraph.inference.lever_arm_bias`).
+A graph is linearised at its noisy estimate. A velocity that is constant in truth trembles in the estimate, the
+linearisation takes the trembling for accelerations, and these seem to show the DVL's misalignment and scale: spurious
+information, even along a straight line. It is found by adding the same noise again (simulation extrapolation; Cook and
+Stefanski 1994): noise of the states is drawn from the graph's own posterior, added to the estimate with both signs, and
+the information gained by that is subtracted once. The effect of the gyro's noise through the DVL's lever arm is
+subtracted by its equation (`rovgraph.inference.lever_arm_bias`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from rovgraph.problem.calibration_roles import CalibrationRoles
 
 # sd after the dive over sd before. Below 0.3 more than nine tenths of the variance are gone and
 # the data outweigh the prior ten to one, so a wrong prior does no harm. Above 0.8 the data have less
-# than 0.6 of the prior's weight: what they say is mostly the prior repeated, and no estimate to act upon.
+# than 0.6 of the prior's weight: such values mostly repeat the prior, and are no basis for action.
 OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE = 0.3, 0.8
 OBSERVABLE, WEAK, UNOBSERVABLE = "observable", "weak", "unobservable"
 SPURIOUSLY_OBSERVABLE = (
@@ -34,18 +33,18 @@ SPURIOUSLY_OBSERVABLE = (
 )  # by noise: multiplied by the velocity in what is measured
 DOUBTFUL_ABOVE = 0.15  # an sd of these below it is not noise: half an hour straight ahead takes it to 0.43
 
-STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves little
+STILL = 0.95  # of the prior's sd: above it noise has little effect
 
 
 def verdict(ratio: float) -> str:
-    """What an sd, as a part of the prior's, means."""
+    """Verdict on an sd, as a part of the prior's."""
     if ratio > UNOBSERVABLE_ABOVE:
         return UNOBSERVABLE
     return OBSERVABLE if ratio < OBSERVABLE_BELOW else WEAK
 
 
 def data_information(covariance: Array, prior_sd: Array) -> Array:
-    """What the data add to the prior, in units of its sd.
+    """Information that the data add to the prior, in units of its sd.
 
     Parameters
     ----------
@@ -62,7 +61,7 @@ def relative_covariance(information: Array) -> Array:
 
 
 def without_spurious_information(best: Optimum, keyframes: Sequence[int], information: Array, sd: Array) -> Array:
-    """Information without what noise in the estimate pretends.
+    """Information without the spurious part from noise in the estimate.
 
     Parameters
     ----------
@@ -116,7 +115,7 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
 
 
 def shown(best: Optimum) -> list[str]:
-    """What is considered and the dive shows, so that it is better estimated."""
+    """Considered variables that the dive shows, so that they should be estimated."""
     if not best.unknowns.considered:
         return []
     relative = best.relative_sd()
@@ -126,8 +125,8 @@ def shown(best: Optimum) -> list[str]:
 
 
 def shown_below(best: Optimum, name: str) -> float:
-    """The sd of a constant, as a part of the prior's, below which a dive shows it: less where noise may feign it."""
-    if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not feign
+    """The sd of a constant, as a part of the prior's, below which a dive shows it: less with spurious information."""
+    if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not make spurious
         return OBSERVABLE_BELOW
     return DOUBTFUL_ABOVE if name in SPURIOUSLY_OBSERVABLE else OBSERVABLE_BELOW
 

@@ -1,4 +1,4 @@
-"""The optimum of a dive, whichever solver found it, and how certain it is."""
+"""The optimum of a dive and its covariances, whichever solver found it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ OTHERS = 9  # components of `Knowledge.covariance` before those of the calibrati
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known at m keyframes, from all data up to each.
+    """Estimates of the calibration at m keyframes, from all data up to each.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Optimum(Protocol):
         ...
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
-        """What is known from the data up to each of some keyframes, increasing, the first beyond 0."""
+        """Estimates of the calibration from the data up to each of some keyframes, increasing, the first beyond 0."""
         ...
 
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
@@ -107,7 +107,7 @@ class Optimum(Protocol):
         ...
 
     def relative_sd(self) -> dict[str, Array]:
-        """The sd of what is considered, were it estimated, as a part of the prior's: name -> ndarray, shape (dim,)."""
+        """The sd of considered variables if estimated, as a part of the prior's: name -> ndarray, shape (dim,)."""
         ...
 
     def estimating(self, names: Sequence[str]) -> "Optimum":

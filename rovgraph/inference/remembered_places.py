@@ -1,15 +1,12 @@
 """Places that a filter remembers: stochastic cloning (Roumeliotis and Burdick 2002).
 
-A filter keeps no old positions, so each place that is seen becomes a part of its state: the
-position where it is, with its covariance and with its correlation to all else. Seen again, it
-corrects what has drifted since, by exactly what the two have not in common, and the filter
-claims no more than it knows. Places come after all other components of the error, two each,
-north and east. They do not move, and errors of theirs are in n, so a correction leaves their
-coordinates alone.
+A filter keeps no old positions, so each place that is seen becomes a part of its state: its position, with covariance
+and with correlation to the rest of the state. When it is seen again, it corrects the drift since, consistently by these
+correlations. Places come after all other components of the error, two each, north and east. They do not move, and their
+errors are in n, so a correction does not change their coordinates.
 
-A landmark that fits no place of its name begins another place, as in `rovgraph.inference.graph.places`;
-so a false one spoils nothing. Of more than `place.remembered` places the one that was not seen
-for longest is forgotten.
+A landmark that fits no place of its name begins another place, as in `rovgraph.inference.graph.places`; so a false one
+does no harm. Beyond `place.remembered` places, the one that was not seen for longest is forgotten.
 """
 
 from collections.abc import Sequence
@@ -44,7 +41,7 @@ def rows(size: int, index: int) -> slice:
 
 
 def columns(size: int, chosen: Sequence[int]) -> Array:
-    """Components of all that is no place, and of some places."""
+    """Components of the state without its places, and of some places."""
     return np.concatenate([np.arange(size), *(np.r_[rows(size, k)] for k in chosen)])
 
 
@@ -67,7 +64,7 @@ def moved(places: Sequence[RememberedPlace], delta: Array) -> tuple[RememberedPl
 
 
 def common(some: Sequence[RememberedPlace], others: Sequence[RememberedPlace]) -> tuple[list[int], list[int], Array]:
-    """Places that two estimates both know.
+    """Places in both of two estimates.
 
     Returns
     -------
@@ -105,7 +102,7 @@ class Match:
 def nearest(
     P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[RememberedPlace], name: float
 ) -> Match | None:
-    """The place of a name that a landmark fits best; None where there is none.
+    """The place of a name that a landmark fits best; None if it fits no place.
 
     Parameters
     ----------

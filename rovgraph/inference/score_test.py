@@ -1,10 +1,10 @@
-"""What a dive says of constants that its estimate holds.
+"""Score tests for calibration constants that are held fixed.
 
 A constant that is held (the DVL's scale, the tilt of its mounting, the gyro's scale, a time offset) is released
 together with what is estimated, in one Gauss-Newton step from the optimum: the Lagrange multiplier or score test
 (Rao 1948; Engle 1984). Where the configuration is right, the step over its sd is a standard normal number, so a step
-of many sds says that the constant is not what it is held at, and the step says what it is instead. Each is released by
-itself: two that move the same measurements would hide each other. Spurious information of the DVL's arm is taken off
+of many sds means that the constant has another value, which the step gives. Each is released by itself: two that affect
+the same measurements would hide each other. Spurious information of the DVL's arm is subtracted
 (`rovgraph.inference.lever_arm_bias`).
 """
 
@@ -49,7 +49,7 @@ class ScoreTest:
 def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
     """A dive as `score_test` takes it: itself, or where places were seen, its chain without them about the same point.
 
-    The step of a constant is then what all other measurements say of it.
+    The step of a constant is then determined by all other measurements.
     """
     if isinstance(best, ChainOptimum):
         return best

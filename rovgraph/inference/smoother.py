@@ -1,6 +1,6 @@
 """Batch smoothing of a whole dive.
 
-The optimum of a dive: a chain where no place is seen twice, and GTSAM's graph where loops are closed.
+`optimum` solves a chain where no place is seen twice, and GTSAM's graph where loops are closed.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -45,7 +45,7 @@ def optimum(
     calibration: Mapping[str, Array] | None = None,
     searches: Searches | None = None,
 ) -> Optimum:
-    """Solve a dive; what is considered is estimated where the dive shows it.
+    """Solve a dive; considered variables are estimated where the dive shows them.
 
     Parameters
     ----------
@@ -76,13 +76,13 @@ def optimum(
 def _contradicted(best: ChainOptimum) -> bool:
     """Whether many measurements of a sensor are rejected, as those of a DVL whose mounting is held where it is not.
 
-    A stretch that was taken out is an explanation of its own.
+    An excluded interval is an explanation of its own.
     """
     return not best.solution.stretches and rejects(best.solution.gates, CONTRADICTED)
 
 
 def _explains(free: ChainOptimum, best: ChainOptimum) -> bool:
-    """Whether what is considered explains, within its priors, what a dive rejects that holds it.
+    """Whether considered variables, within their priors, explain rejections of a dive that holds them.
 
     What is further off than that is named wrongly rather than known badly.
     """
@@ -92,7 +92,7 @@ def _explains(free: ChainOptimum, best: ChainOptimum) -> bool:
 
 
 def _with_what_is_shown(free: ChainOptimum, considered: Sequence[str], hidden: Collection[str]) -> ChainOptimum:
-    """The optimum with what is considered estimated as far as the dive shows it, from where all of it is.
+    """The optimum with those considered variables estimated that the dive shows, from one with all estimated.
 
     Where what is left contradicts the dive again, all but what noise moves is.
     """
@@ -126,7 +126,7 @@ class BatchSmoother:
     problem : the same as arrays
     left_out : (sensor, reason) -> count of measurements that never reach it
     time_offsets : how late stamps are
-    searches : for stretches of wrong measurements, shared with whoever solves the same dive
+    searches : for faulty intervals, shared by all that solve the same dive
     """
 
     initial: InitialConditions
@@ -192,7 +192,7 @@ def assemble(
     time_offsets: TimeOffsets | None = None,
     searches: Searches | None = None,
 ) -> BatchSmoother:
-    """All keyframes of a log and what lies between them; ``time_offsets`` None = as the configuration believes."""
+    """All keyframes of a log and what lies between them; ``time_offsets`` None = as configured."""
     assembly = assembly_of(initial, time_offsets)
     assembly.take(log)
     assembly.extend(finish=True)
@@ -207,7 +207,7 @@ def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
 
 @stage
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
-    """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
+    """The optimum with its marginal covariances; variables that noise may bias and the dive does not show are held."""
     best, relative = without_what_noise_moves(best)
     states, problem = best.state, best.problem
     covariances = best.covariances()
@@ -254,7 +254,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
 
 
 def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
-    """What is estimated, jointly, at the end of the dive; None where nothing is.
+    """Joint estimate of the calibration at the end of the dive; None without estimated variables.
 
     Returns
     -------

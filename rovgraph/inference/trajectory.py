@@ -2,7 +2,7 @@
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
 v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
-Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for
+Unix time, and ``lat, lon`` if the origin of n on Earth is known. TUM files hold ``time x y z qx qy qz qw`` in n, for
 tools such as ``evo_ape``.
 """
 
@@ -21,7 +21,7 @@ from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
 
 FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
-TUM = ".ned.tum"  # end of the name of a TUM file, which says its frame
+TUM = ".ned.tum"  # end of the name of a TUM file, with its frame
 TUM_FRAME = "time [s], position in north, east, down [m], quaternion x y z w from forward, starboard, down to those"
 POSITION = ["north", "east", "down"]
 ATTITUDE = ["roll", "pitch", "yaw"]
@@ -187,7 +187,7 @@ class Trajectory:
         write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
 
     def write_tum(self, path: Path | str) -> None:
-        """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
+        """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line states them (its name should: `TUM`)."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
         poses = line * len(rows) % tuple(rows.ravel().tolist())
@@ -225,8 +225,8 @@ def _slerp(time: Array, R: Array, at: Array) -> Array:
 def read_trajectory(path: Path | str) -> Trajectory:
     """Read a trajectory CSV: ``time, north, east``, the rest optional.
 
-    Columns that are missing are NaN in the result (rotations too), so that what a
-    file does not know cannot be mistaken for a zero.
+    Columns that are missing are NaN in the result (rotations too), so that a missing value
+    cannot be mistaken for a zero.
 
     Raises
     ------
@@ -240,7 +240,7 @@ def read_table(path: Path | str) -> pd.DataFrame:
 
     Raises
     ------
-    InputError : no such file, no CSV, a required column missing, something that is no number
+    InputError : no such file, no CSV, a required column missing, a cell that is not a number
     """
     path = as_path(path, "trajectory")
     if path.is_dir():

@@ -1,14 +1,14 @@
-"""Where the variance of a position comes from: how much of it each sensor's noise and each prior brings.
+"""Sources of the variance of a position: the share of each sensor's noise and of each prior.
 
 The optimum is linear in the whitened errors e of all rows, which are independent with unit variance. With A their
 Jacobian and s = (A'A)^-1 u the covariance of all variables with the position along u,
 
     error along u = s' A' e,   so   variance along u = sum over rows of (A_i s)^2,
 
-and each term is what row i brings. What is considered, not estimated (Schmidt), adds the square of its effect times
-its prior's variance.
+and each term is the share of row i. A considered variable (Schmidt) adds the square of its effect times its prior's
+variance.
 
-A long dive is gone through in pieces: what is eliminated of it, and the Jacobians of its measurements, are large.
+A long dive is processed in pieces, since its conditionals and the Jacobians of its measurements are large.
 """
 
 import numpy as np
@@ -102,7 +102,7 @@ def _by_held(root: SquareRoot, keyframe: int, held: int) -> Array:
 
 
 def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, float]]:
-    """What the IMU's noise, priors and walks bring: their residuals are differenced along the step."""
+    """Shares of the IMU's noise, priors and walks: their residuals are differenced along the step."""
     ahead, behind = (chain.moved(point, step, sign * STEP / _size(step)) for sign in (1.0, -1.0))
     scale = (_size(step) / (2 * STEP)) ** 2
     out = [("imu", scale * _squares(chain.problem.motion_residuals(ahead) - chain.problem.motion_residuals(behind)))]

@@ -1,6 +1,6 @@
-"""Chains with more unknowns than a dive's: constants that its estimate holds, or errors that last.
+"""Chains with additional unknowns: constants that the estimate holds, or errors that last.
 
-What held constants would do to the estimate follows from one elimination where it stands, without another solution:
+The effect of held constants on the estimate follows from one elimination at the optimum, without another solution:
 their derivatives are those of the measurement equations, of the IMU's mean signals for its scales, and of the
 predictions by time for stamps.
 """
@@ -73,7 +73,7 @@ def lasting_belief(before: Belief, sd: float, time_constant: float, changes: tup
 
 @dataclass(frozen=True)
 class _WidenedChain(Chain):
-    """A chain with the measurements of sensors whose stamps may be late, which no kernel knows."""
+    """A chain with the measurements of sensors whose stamps may be late and that have no kernel."""
 
     timed: Mapping[str, Measurements]
 
@@ -105,7 +105,7 @@ class _TimedMeasurements(Measurements):
 
 
 def _timed(one: Measurements, wide: CalibrationRoles, chain: Chain, state: State) -> _TimedMeasurements:
-    """Measurements that know how their predictions change with time [unit/s], from the keyframes around each."""
+    """Measurements with the rate of their predictions [unit/s], from the keyframes around each."""
     model, time, rate_b = one.instrument.model, chain.problem.time, chain.problem.rate_b
     before = np.maximum(one.keyframe - (one.dt < SHORT_S), 0)
     after, slope = np.minimum(one.keyframe + 1, len(time) - 1), np.empty(one.z.shape)

@@ -74,8 +74,8 @@ WHICH, KEYFRAME_OF, INTERVAL_OF, LINE_OF, WINDOW_OF, NUMBER_OF, OF = 0, 1, 2, 3,
 
 SHORTEST_S = 1e-3  # an interval
 KNOT_WINDOW_S = 0.1  # either side of a knot, over which the rate is taken; the less noise is in its slope the better
-PERIODS = 50  # of samples, from whose median a gap is told
-LONGEST_CRUISED_S = 10.0  # between measurements without an IMU; in a longer silence nobody knows which way it turned
+PERIODS = 50  # of samples, whose median defines a gap
+LONGEST_CRUISED_S = 10.0  # between measurements without an IMU; in a longer outage its turns are unknown
 KNOCK = 3.0  # times the believed noise, before an interval's own scatter is taken
 NOISIER = 1.25  # times the believed density, before what samples show as a rule is taken
 INTERVALS, ENOUGH = 200, 20  # the newest intervals that show it, and how many are enough
@@ -91,7 +91,7 @@ class KeyframeRule(NamedTuple):
     max_gap, longest, min_gap : between keyframes where no ping comes; while one may come still; least [s]
     segment_s : of time, in which calibration that walks has one value [s]
     every_s : time after which a place counts again [s]
-    without_imu, learns, scaled : 1 = there is no IMU; noise is learnt; the IMU's scale may be off
+    without_imu, learns, scaled : 1 = no IMU; noise is learnt; the IMU's scale may be wrong
     rate_sd : of the rate without an IMU [rad/s]
     """
 
@@ -108,7 +108,7 @@ class KeyframeRule(NamedTuple):
 
 
 class Streams(NamedTuple):
-    """What has come.
+    """Samples and events that have arrived.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Streams(NamedTuple):
     events : shape (e, VALUES + 2 D), in the order in which they came
     order : shape (e,), events in the order of where they are put
     sensors : shape (s, ABOUT)
-    steps : shape (PERIODS + 1,), step between two samples that is no gap, by so many periods [s]
+    steps : shape (PERIODS + 1,), longest regular sample interval, by so many periods [s]
     """
 
     imu: Matrix
@@ -175,7 +175,7 @@ class DiveArrays(NamedTuple):
 
 @helper
 def _longest_step(steps: Array, count: int) -> float:
-    """Step between two samples that is no gap, as it is known after so many samples [s]."""
+    """Longest regular sample interval, after so many samples [s]."""
     return float(steps[min(max(count, 1), len(steps)) - 1])
 
 
@@ -272,7 +272,7 @@ def _look(streams: Streams, dive: DiveArrays, rule: KeyframeRule, until: float) 
 
 @helper
 def _finish(streams: Streams, dive: DiveArrays, rule: KeyframeRule) -> None:
-    """Place the rest, and a last keyframe at the last sample; says what lies beyond them."""
+    """Place the rest, and a last keyframe at the last sample; returns what lies beyond them."""
     events, order, counts = streams.events, streams.order, dive.counts
     end = streams.imu[counts[SAMPLES] - 1, 0]
     _look(streams, dive, rule, end)
@@ -360,7 +360,7 @@ def _first_covering(imu: Array, time: float, span: float) -> int:
 
 @helper
 def _noise_of_rate(step: float, share: float, longest_step: float, gyr: float) -> float:
-    """Noise of a fitted rate, by what `fit_rate` tells of it [rad/s]."""
+    """Noise of a fitted rate, by the results of `fit_rate` [rad/s]."""
     if step > longest_step:
         return BRIDGE_GYR
     return gyr * math.sqrt(share / (step if step > 0.0 else 1.0))
@@ -504,7 +504,7 @@ def _motion(
     keyframe[BELIEVED : BELIEVED + 2] = dive.keyframes[k - 1, BELIEVED : BELIEVED + 2]
     keyframe[SCATTER] = keyframe[SCATTER + 1] = math.nan
     noise = row[motion_row.NOISE : motion_row.NOISE + 2]
-    if rule.without_imu != 0.0:  # the vehicle goes on as it went, in a long silence whichever way it turns
+    if rule.without_imu != 0.0:  # constant velocity; in a long outage the heading is unknown
         row[motion_row.GAP] = motion_row.NO_IMU
         if within > LONGEST_CRUISED_S:
             noise[0], noise[1], row[motion_row.GAP] = BRIDGE_ACC, BRIDGE_GYR, within

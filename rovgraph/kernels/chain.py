@@ -14,13 +14,11 @@ reflections of these rows, to
 
 (Golub and Van Loan 2013, 5.1 and 5.2; Bierman 1977, chapters IV and X), from which solution, covariances, draws
 and sensitivities follow backwards in time (`rovgraph.kernels.chain_posterior`). The information matrix is never
-formed: that squares the condition number, and a motion's rows tell positions to 1e-3 m where the prior may tell
-them to 1000 m.
+formed: that squares the condition number, and a motion's rows determine positions to 1e-3 m where the prior may be
+1000 m wide.
 
-A target is the place of a column that rows have beyond their own: below d a component of x_k, from d on a
-component of y. What a negative target stands for is ignored.
-
-Rows made triangular by Householder reflections (Golub and Van Loan 2013, 5.1 and 5.2).
+A target is the index of a column that rows have beyond their own: below d a component of x_k, from d on a
+component of y. Columns with a negative target are ignored.
 """
 
 import math
@@ -48,7 +46,7 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
     space of as many elements as W has rows and columns.
     """
     if pivot < 0 or first < 0 or column < 0:
-        return  # it never is; the compiler must know it to use vector instructions
+        return  # never true; lets the compiler use vector instructions
     count = last - first
     square, other = 0.0, 0.0
     for i in range(count):
@@ -108,7 +106,7 @@ PENDING = 48  # rows that are folded into the border at a time
 
 
 class Walks(NamedTuple):
-    """What walks from keyframe to keyframe: ``weight (x_{k+1} - kept x_k) = r`` is white; shape (n - 1, walking)."""
+    """Random walks from keyframe to keyframe: ``weight (x_{k+1} - kept x_k) = r`` is white; shape (n - 1, walking)."""
 
     weight: Matrix
     kept: Matrix
@@ -131,11 +129,11 @@ class PlacedRows(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """What an elimination writes.
+    """Output of an elimination.
 
     Attributes
     ----------
-    stops : shape (f,), increasing, keyframes at which to keep what the rows up to there say
+    stops : shape (f,), increasing, keyframes at which to keep the information of the rows so far
     conditionals : shape (n, d, 2 d + c + 1), columns R_k, S_k, T_k, z_k
     border : shape (c, c + 1), columns R_y, z_y
     filtered : shape (f, d + c, d + c + 1), triangular: rows of that keyframe and of the border, of data up to it

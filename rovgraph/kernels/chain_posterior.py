@@ -1,4 +1,4 @@
-"""What an eliminated chain says, backwards in time: solution, sensitivities, draws and covariances.
+"""Solution, sensitivities, draws and covariances of an eliminated chain, backwards in time.
 
 From the conditionals of `rovgraph.kernels.elimination.eliminate`,
 

@@ -202,7 +202,7 @@ def _try_out(options: _Compilation) -> None:
 
 
 def cache_folder(module: str) -> Path | None:
-    """Where a module's compiled kernels are kept, or None where nothing can be written; says when they are missing."""
+    """Where a module's compiled kernels are kept, or None where no folder can be written; reports missing ones."""
     parent = _writable_parent()
     if parent is None:
         return None

@@ -2,35 +2,30 @@
 
     r = W (z - h(x)),  H = W dh/dx                    whitened innovation of each measurement, at its own time
     NIS = r' (H P H' + I)^-1 r                        beyond gate^2 it is left out
-    dx, P                                             `rovgraph.kernels.correction`
+    dx, P                                             the update below
     x <- x + dx, P <- B P B'                          `rovgraph.kernels.error_coordinates`
 
-Which measurements enter, and what a sensor does that was left out for long, is in `rovgraph.kernels.correction`.
+Gates. A sensor that was left out for longer than `DISTRUSTED_S` returns only within `RETURN_SD` of the prediction,
+whose uncertainty grows without it. After more than its `READMIT` the sensor is taken to measure a motion that no model
+has, and the covariance of what it observes is inflated: of velocity along the axes, n's or the body's, along which it
+is known better.
 
-Which measurements a filter lets in, and what a sensor that was left out may have seen meanwhile.
-
-A sensor that was left out for longer than `DISTRUSTED_S` returns only within `RETURN_SD` of what the filter, whose
-uncertainty grows without it, holds possible. Left out for longer than its `READMIT`, it is believed to see something
-that no model knows, and inflates the covariance of what it sees.
-
-A Kalman filter's update with gates and robust losses, for one keyframe.
-
-Innovations r and Jacobians H are whitened, so their noise is I. With S = H P H' and W the weights of the losses,
+Update. Innovations r and Jacobians H are whitened, so their noise is I. With S = H P H' and W the weights of the
+losses,
 
     d = P H' W^1/2 (W^1/2 S W^1/2 + I)^-1 W^1/2 r,   w_j = rho'(|e_j|) / |e_j|,   e = r - H d
 
 are iterated (Huber 1964; Zhang 1997): weights follow from the residuals after the update, as in the smoother's
-cost, not from the innovations, which a prior that knows little makes large. The covariance is Joseph's,
+cost, not from the innovations, which a wide prior makes large. The covariance is Joseph's,
 P <- (I - K H) P (I - K H)' + K K', multiplied out so that it costs products of rank m only.
 
-What is considered is uncertain and never corrected, nor does it move a gain or a gate. Its part of the estimate's error
-is B y, y white and of unit variance, so that the covariance of the estimate is P + B B'. With H_y the Jacobian by y,
+A considered variable is uncertain and never corrected, nor does it move a gain or a gate. Its part of the estimate's
+error is B y, y white and of unit variance, so that the covariance of the estimate is P + B B'. With H_y the Jacobian by
+y,
 
     B <- B - K (H B + H_y)                                              the covariance analysis of Schmidt (1966)
 
 Shapes: P (n, n), B (n, h).
-
-Along which axes the filter moves velocity, those of n or of the body.
 """
 
 import math
@@ -252,11 +247,11 @@ def leave_out(found: Innovations, j: int) -> None:
 
 @helper
 def inflate(P: Array, found: Innovations, measurement: int, seen: Array, spread: Array) -> None:
-    """Let something that no model knows have moved what a sensor sees, by as much as its measurement shows.
+    """Inflate the covariance of what a sensor measures, as if moved by something that no model has.
 
     As a knock does to velocity and position: P += |x|^2 (seen seen' + spread spread'), x the least squares solution
-    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor sees, with what has
-    followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
+    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor measures, with what
+    has followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
     """
     n, s = seen.shape
     r, H, A, x = found.r, found.H, np.zeros((s, s)), np.zeros(s)
@@ -406,11 +401,11 @@ def determinant(A: Array) -> float:
 
 @helper
 def coordinates_of_velocity(x: Array, P: Array, layout: ErrorColumns) -> ErrorColumns:
-    """The layout in which velocity moves along those axes, n's or the body's, along which it is known more sharply.
+    """The layout in which velocity moves along the axes, n's or the body's, along which it is known better.
 
-    A DVL knows it along the body's, where a correction of heading must not touch what it has seen. In its silence
-    depth alone knows velocity, along n: moved as the DVL sees it, a correction of tilt by 0.3 degrees would make
-    15 mm/s downwards of a velocity that is 3 m/s off, which depth takes for knowledge of all of the velocity.
+    A DVL measures it along the body's, where a correction of heading must not change it. In an outage of the DVL
+    only depth measures velocity, along n: moved along the body's axes, a correction of tilt by 0.3 degrees would make
+    15 mm/s downwards of a velocity that is 3 m/s off, and depth would seem to determine all of the velocity.
     The measure is the volume of the error's ellipsoid: that of v_n against that of R' v_n, whose error along n is
     d_v + v_n x R d_R.
     """
@@ -555,7 +550,7 @@ class GivenRows(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """What `correct` writes.
+    """Output of `correct`.
 
     Attributes
     ----------

@@ -36,7 +36,7 @@ SHORTEST_S = 0.02  # between two velocities
 
 
 class Motions(NamedTuple):
-    """The IMU's motion to each of m epochs from the one before, zero where it is none.
+    """The IMU's motion to each of m epochs from the one before, zero where there is no motion.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Motions(NamedTuple):
 
 
 class Aiding(NamedTuple):
-    """What is measured at m epochs.
+    """Measurements at m epochs.
 
     Attributes
     ----------
@@ -86,12 +86,12 @@ class LevelStart(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What is taken as known.
+    """Constants that are taken as known.
 
     Attributes
     ----------
     gravity : [m/s^2]
-    valid_s : for how long a ping says how fast the vehicle is [s]
+    valid_s : for how long a ping's velocity is used [s]
     held : squared density of the noise of a velocity that is held from then on
     deviation_var : of the compass [rad^2]
     w_ie_n : rate of the Earth in n [rad/s]

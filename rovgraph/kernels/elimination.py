@@ -1,10 +1,10 @@
 """A dive's factors at a point: linearised and eliminated in one pass, or what they cost.
 
 The rows of `rovgraph.kernels.chain`, a keyframe at a time: motions of `rovgraph.kernels.motion_residual`, measurements
-of `rovgraph.kernels.linearization`, and the walks of calibration. What no kernel knows, as priors and the measurements
-of sensors from outside, comes as rows. Nothing but what is eliminated is kept for the whole dive.
+of `rovgraph.kernels.linearization`, and the walks of calibration. Rows that no kernel computes, as priors and the
+measurements of sensors from outside, are arguments. Only the eliminated rows are kept for the whole dive.
 
-A chain whose rows are at hand, eliminated: for studies of the solver; `rovgraph.kernels.elimination` makes them itself.
+`eliminate_dive` linearises and eliminates; `eliminate` takes rows that are given, for studies of the solver.
 """
 
 import math
@@ -41,7 +41,7 @@ from rovgraph.kernels.weighting import loss_weight, robust_cost
 
 
 class DiveFactors(NamedTuple):
-    """What is constant of a dive of n keyframes.
+    """The constant part of a dive of n keyframes.
 
     Attributes
     ----------
@@ -108,14 +108,14 @@ def eliminate_dive(
     border_rows: Matrix,
     out: Elimination,
 ) -> int:
-    """Linearise all factors at a point and eliminate them, as `rovgraph.kernels.elimination.eliminate`.
+    """Linearise all factors at a point and eliminate them, as `eliminate` does.
 
     Parameters
     ----------
-    entered : shape (m,), measurements that are let in
+    entered : shape (m,), admitted measurements
     column : shape (15 + C,), target of each component of state and calibration, -1 where it is not estimated
-    given : of what no kernel knows
-    border_rows : as `rovgraph.kernels.elimination.eliminate`
+    given : rows that no kernel computes
+    border_rows : as in `eliminate`
     out : of fewer conditionals than keyframes the last one is that of the last keyframe
     """
     b, c = point.b, point.c
@@ -172,7 +172,7 @@ def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> Non
 
 @kernel()
 def robust_costs(square: Vector, which: Index, sensors: Matrix, entered: Flags) -> float:
-    """Sum of the robust costs of measurements of some squared lengths, of those that are let in."""
+    """Sum of the robust costs of the admitted measurements, from their squared lengths."""
     total = 0.0
     for m in range(len(square)):
         if entered[m]:

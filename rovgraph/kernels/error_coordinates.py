@@ -1,17 +1,16 @@
 """The error of a state in coordinates in which measurements are linear, and how it moves from state to state.
 
 A Kalman filter linearises at an estimate which it then corrects. Measured in coordinates that turn with the
-correction, its errors become smaller than they are: it takes its own corrections of heading, misalignment and hard
-iron for knowledge (Huang, Mourikis and Roumeliotis 2010). An invariant filter chooses coordinates that stay (Barrau
-and Bonnabel 2017). Here these are attitude and position in n, and for one variable of each instrument the error of
-what that instrument sees: of velocity as the DVL sees it, of hard iron as the field that the magnetometer sees, of a
-compass offset as the heading it shows, of a current as the water's velocity along the vehicle's axes, which drag
-shows. A measurement is linear in them whatever heading and mounting are, so correcting one teaches nothing about
-those.
+correction, its covariance becomes too small: corrections of heading, misalignment and hard iron count as information
+(Huang, Mourikis and Roumeliotis 2010). An invariant filter chooses coordinates that stay (Barrau and Bonnabel 2017).
+Here these are attitude and position in n, and for one variable of each instrument the error of what that instrument
+measures: of velocity along the DVL's axes, of hard iron as the field along the magnetometer's axes, of a compass offset
+as the heading it shows, of a current as the water's velocity along the vehicle's axes, which drag shows. A measurement
+is linear in them whatever heading and mounting are, so correcting one adds no information about those.
 
 The error vector is that of `rovgraph.kernels.layout`, of the calibration only what is estimated. From a state x to
 another x', attitude and position in n stay as they are, and of each instrument s one variable y_s moves so that
-what the instrument sees, z_s = h_s(x), moves as its Jacobian H_s at x says:
+the measured value z_s = h_s(x) moves by its Jacobian H_s at x:
 
     x' = x + d, R' = R Exp(d_R), p' = p + R d_p, then for each s:  y_s' += Y'^-1 (h_s(x) + H_s d - h_s(x'))
 
@@ -20,12 +19,10 @@ of the pose and of each y_s differ from the unit matrix:
 
     B_R = B_p = R'^T R,    H_s' B = H_s,  so  B_s = Y'^-1 (H_s - (H_s' without Y') B)
 
-An instrument sees one variable y_s and depends on no other that is seen. Which ones these are stands in
-`rovgraph.inference.filter`.
+An instrument observes one variable y_s and depends on no other of these. `rovgraph.inference.filter` lists them.
 
-P <- B P B' for a basis B of which few rows differ from the unit matrix.
-
-With T = B P, of which only those rows are calculated, and from what is not zero in them,
+The change of basis P <- B P B' uses that few rows of B differ from the unit matrix. With T = B P, of which only those
+rows are calculated, and from what is not zero in them,
 
     (B P B')_ri = T_ri for a row r of those and any other i,    (B P B')_rq = sum over k of T_rk B_qk
 """
@@ -53,7 +50,7 @@ Indices = NDArray[np.int64]
 
 
 class ErrorColumns(NamedTuple):
-    """What of the calibration is estimated, and what the instruments see.
+    """Columns of the estimated calibration, and the variables that instruments observe.
 
     Attributes
     ----------

@@ -1,6 +1,7 @@
-"""What the filter carries from keyframe to keyframe, and what it knows of the vehicle, as kernels take both.
+"""State and model of the filter, as kernels take them.
 
-An estimate moved along the coordinates of its error, and the error between two estimates.
+`FilterState` is carried from keyframe to keyframe, `FilterModel` holds what stays. `retract_with_covariance` moves an
+estimate along the coordinates of its error; `local_coordinates` is the error between two estimates.
 """
 
 from typing import NamedTuple

@@ -1,14 +1,14 @@
 """The filter over one interval, and over many in a row: correct, predict, correct.
 
-`filter_intervals` is what `rovgraph.inference.filter.FilterEngine.step` does, as far as nothing is needed that no
-kernel knows: it stops before an interval with a measurement that is `GIVEN`, and where the attitude is so poorly known
-that it has to be found before it is linearised at (`rovgraph.inference.filter`).
+`filter_intervals` does the work of `rovgraph.inference.filter.FilterEngine.step`, as far as kernels can: it stops
+before an interval with a measurement that is `GIVEN`, and where the attitude is so poorly known that it must be found
+before the measurements are linearised there (`rovgraph.inference.filter`).
 
-The filter's prediction over one interval.
+The prediction over one interval is
 
     x_j = f(x_i, b + S k),  e_j = F e_i + w,  P_j = F P_i F' + Q
 
-    B_j = F B_i + F_y                                                     of what is considered
+    B_j = F B_i + F_y                                                     of considered variables
 
 f, F and Q of pose, velocity and bias are the motion's (`rovgraph.kernels.motion`); k are the IMU's scale errors
 where S is given. Calibration that walks adds its variance a second times the interval to Q; with a time constant it
@@ -161,7 +161,7 @@ def attitude_variances_of(x: AnyVector, P: AnyMatrix) -> tuple[float, float]:
 
 @helper
 def knows_all(which: Index, sensors: Array) -> bool:
-    """Whether kernels know the equations of all measurements."""
+    """Whether kernels have the equations of all measurements."""
     given = 0
     for j in range(len(which)):
         given += sensors[which[j], KIND] == GIVEN
@@ -201,7 +201,7 @@ class Interval(NamedTuple):
 
     Attributes
     ----------
-    motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
+    motion : row of `rovgraph.kernels.motion_row`, or (0,) if all measurements are at one keyframe
     covariance : of the motion's residual, shape (15, 15)
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     measured : its measurements
@@ -219,7 +219,7 @@ class Interval(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What `take_interval` writes beside the estimate at the end.
+    """Output of `take_interval` beside the estimate at the end.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ class Intervals(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What `filter_intervals` writes.
+    """Output of `filter_intervals`.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ The error of a state, and so the columns of every Jacobian, is in this order:
     15  calibration       the calibration vector, in the order below
 
 The calibration vector has the rows of `rovgraph.model.calibration.TABLE` in their order, built-in ones first; those
-that are registered later follow. Its places are written down here, because kernels need them when they are compiled;
+that are registered later follow. Its indices are constants here, because kernels need them when they are compiled;
 `rovgraph.model.calibration.LAYOUT` gives them by name, and a test holds both equal.
 """
 

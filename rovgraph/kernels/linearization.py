@@ -4,16 +4,7 @@
 
 with the bias b + S k where the IMU's scale may be off by k (`rovgraph.problem.motion`).
 
-An instrument whose stamps are late by tau measured at stamp - tau. A derivative by time would do for an offset that is
-small against the motion; half a second is not. So the motion from the keyframe is kept at knots around the stamp, as
-far as the prior of tau reaches, and interpolated: rotation along its geodesic, velocity and position linearly, and the
-rate on cubic arcs (Catmull and Rom 1974). Linear pieces would not do for the rate: noise of a knot and of the slope
-beside it go together, which through the lever arm feigns an offset. The slope of these arcs is as symmetric about a
-knot as the knot is. Predictions are exact for any tau, and
-
-    dh/dtau = H (d rotation, d position, d velocity)/dtau - H_bias d rate/dtau
-
-The state between a keyframe and a measurement's own time, with its derivative.
+The state x(t) at a measurement's own time is
 
     R(t) = R_i dR'                          dR' = dR Exp(-dt b_g')
     v(t) = v_i + g dt + R_i dv'             dv' = dv - dt b_a'
@@ -29,6 +20,15 @@ order of `rovgraph.kernels.layout`, the derivative F of the state at t by that a
     velocity      -R_i S(dv')               by rotation,  I by velocity,  -dt R_i by accelerometer
 
 and the biases stay.
+
+Late stamps. An instrument whose stamps are late by tau measured at stamp - tau. A derivative by time suffices for an
+offset that is small against the motion; half a second is not. So the motion from the keyframe is kept at knots around
+the stamp, as far as the prior of tau reaches, and interpolated: rotation along its geodesic, velocity and position
+linearly, and the rate on cubic arcs (Catmull and Rom 1974). Linear pieces fail for the rate: the noise of a knot and
+that of the slope beside it are correlated, which through the lever arm looks like an offset. The slope of the cubic
+arcs is symmetric about each knot. Predictions are exact for any tau, and
+
+    dh/dtau = H (d rotation, d position, d velocity)/dtau - H_bias d rate/dtau
 """
 
 import math
@@ -338,7 +338,7 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
     row, sensor = one.row, one.sensor
     kind, dim = int(sensor[KIND]), int(sensor[DIM])
     z, H, W = scratch.z[:dim], scratch.H[:dim], scratch.W[:dim, :dim]
-    for a in range(dim):  # columns that are not estimated nobody reads
+    for a in range(dim):  # columns that are not estimated are not read
         for j in range(MOTION):
             H[a, j] = 0.0
         for j in scratch.used:
@@ -461,7 +461,7 @@ def place_measurements(
     rate_out: Matrix,
     F_out: Matrices,
 ) -> None:
-    """States at the own times of m measurements, for models that no kernel knows; with derivatives.
+    """States at the own times of m measurements, for models without a kernel; with derivatives.
 
     Parameters
     ----------

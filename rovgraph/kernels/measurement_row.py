@@ -1,4 +1,4 @@
-"""How a measurement, and a sensor, are laid out in one row of numbers.
+"""Layout of a measurement, and of a sensor, in one row of numbers.
 
 =============  =====  ==========================================================================================
 measurement

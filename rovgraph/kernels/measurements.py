@@ -1,7 +1,7 @@
 """Measurement equations with their derivatives, for one epoch and for many.
 
-Each equation is written once, here and in `rovgraph.kernels.measurements`; simulator, graph, filters and observability
-call it through the models of `rovgraph.sensors`, the filter's kernel calls `predict`.
+Each equation is written once, here. Simulator, graph, filters and observability call it through the models of
+`rovgraph.sensors`; kernels call `predict`.
 
 ==============  =========================================================  ==================
 kind            equation                                                   source
@@ -42,7 +42,7 @@ at first can be used again and again:
     WATER_VELOCITY   rotation, current
     TILT             rotation
 
-Heading, deviation of a compass, the magnetometer, and tilt, for one epoch.
+The heading, a compass's deviation and the magnetometer in full:
 
     h = atan2(u_e, u_n) - declination, u = R_nb a, a the instrument's x axis in b
     deviation = A + e + B sin h + C cos h, e an error that lasts          Bowditch
@@ -51,7 +51,6 @@ Heading, deviation of a compass, the magnetometer, and tilt, for one epoch.
                                                                           (3.11), (3.14), S: (3.2)
 
 Signs follow the corrected equations: declination is atan2(H_e, H_n), the heading is clockwise from north.
-`rovgraph.kernels.measurements` says what the arguments are and which columns of ``H_out`` are written.
 """
 
 import math

@@ -1,25 +1,22 @@
-"""The IMU's motion over an interval: prediction and linear transition.
+"""Motion over an interval: prediction and linear transition, with the IMU, through its outage, or without one.
 
-With zeta = (theta, p, v) preintegrated, corrected to first order for the bias b that differs from the assumed one,
+Motions are rows of `rovgraph.kernels.motion_row`. The bias of a state is the one that its samples show; of the
+predicted state only attitude, position and velocity are written. Derivatives are by rotation, position (in body axes),
+velocity (in n), bias.
+
+**With the IMU.** With zeta = (theta, p, v) preintegrated, corrected to first order for the bias b that differs from the
+assumed one,
 
     R_j = R_i Exp(theta),  p_j = p_i + t v_i + t^2 / 2 g + R_i p,  v_j = v_i + t g + R_i v
 
 On a turning Earth this holds in the axes that n has at the beginning, for v + S(w) p in place of v; what comes out
 is turned back by Exp(-t w), and gravity turns meanwhile. Equal to GTSAM's ``PreintegratedCombinedMeasurements``.
 
-Intervals without samples for longer than `LONGEST_BRIDGED_S` are coasted through (`rovgraph.kernels.motion`), those
-of a dive without an IMU are cruised (`rovgraph.kernels.motion`).
-
-Motions are rows of `rovgraph.kernels.motion_row`. The bias of a state is that which is seen; of one that comes out
-only attitude, position and velocity are written. Derivatives are by rotation, position (in body axes), velocity (in n),
-bias.
-
-Motion while the IMU is silent: one interval, written for the callers in `rovgraph.kernels.motion`.
-
-Integrating an interpolated specific force needs the attitude, and an attitude that nobody measures would turn
-gravity into motion: after five seconds, by tens of metres, of which no linear filter recovers. A vehicle that is
-heavy below and light above does not roll over meanwhile. So it is taken to go on as it went, with a velocity that
-walks, a heading that walks, and a tilt that rights itself, a first-order Gauss-Markov process (Gelb 1974):
+**IMU outage**, where samples are missing for longer than `LONGEST_BRIDGED_S`. Integrating an interpolated specific
+force needs the attitude, and an error of an unmeasured attitude turns gravity into motion: after five seconds tens of
+metres, from which a linear filter does not recover. A vehicle that is heavy below and light above does not roll over
+meanwhile. So it is taken to continue as before, with velocity and heading as random walks, and a tilt that rights
+itself, a first-order Gauss-Markov process (Gelb 1974):
 
     tilt_j = a tilt_i + w,  a = exp(-t / RIGHTING_S),  var w = (1 - a^2) TILT_SD^2
     yaw_j = yaw_i + dyaw + w,  p_j = p_i + t v_i + w,  v_j = v_i + w,  bias_j = bias_i + w
@@ -31,10 +28,8 @@ a turn of the body by
         | 0  cos r        -sin r      |,   B^-1 = | 0  cos r  sin r cos p  |
         | 0  sin r sec p  cos r sec p |           | 0  -sin r cos r cos p  |
 
-Motion without an IMU: one interval, written for the callers in `rovgraph.kernels.motion`.
-
-The vehicle goes on as it went along its own axes: nearly constant velocity, white noise acceleration (Bar-Shalom et al.
-2001, 6.2.2), of the velocity u = R_bn v_n in the body's axes, which a turn takes with it; its attitude walks.
+**Without an IMU**: nearly constant velocity, white noise acceleration (Bar-Shalom et al. 2001, 6.2.2), of the velocity
+u = R_bn v_n along the body's axes, which turns with the vehicle; the attitude is a random walk.
 
     R_j = R_i Exp(w),  var w = t d^2
     u_j = u_i + w,     var w = t q^2
@@ -457,7 +452,7 @@ def predict_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionS
 
 @view_helper
 def _add_turning(row: Array, R: Array, scratch: MotionScratch) -> None:
-    """What a turning Earth adds to the derivatives: v + S(w) p is what goes on."""
+    """Terms of a turning Earth in the derivatives, for v + S(w) p in place of v."""
     t, rate, J = row[DURATION], scratch.vectors[0], scratch.J
     spin, spun, turned = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3]
     skew(rate, spin)
@@ -485,7 +480,7 @@ def predict_with_transition(
 ) -> None:
     """The state at the end of one interval; its error's transition and process noise, shape (15, 15).
 
-    The residual's derivatives by both states say A_i e_i + A_j e_j = noise of covariance S. Where the state after
+    The residual's derivatives by both states give A_i e_i + A_j e_j = noise of covariance S. Where the state after
     is the predicted one, A_j is -1 on the diagonal but for velocity, -R_j', so that e_j = F e_i + w with F and
     Q = cov w without an inverse.
     """

@@ -1,12 +1,11 @@
-"""How the states at both ends of an interval disagree with the IMU's motion between them.
+"""Residual of the states at both ends of an interval against the motion between them, with its derivatives.
 
 The residual is that of ``gtsam.CombinedImuFactor``: the logarithm on SE_2(3) of what `rovgraph.kernels.motion`
 predicts, (R, p, v), seen from the keyframe after, and the change of bias:
 
     phi = Log(R_j' R),  r = (phi, Jl(phi)^-1 R_j' (p - p_j), Jl(phi)^-1 R_j' (v - v_j), b_i - b_j)
 
-Of an interval that is coasted through it is that of `rovgraph.kernels.motion`, without an IMU that of
-`rovgraph.kernels.motion`.
+In an IMU outage and without an IMU it is the difference from the prediction of `rovgraph.kernels.motion` for that case.
 """
 
 import math

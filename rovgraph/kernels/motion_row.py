@@ -14,8 +14,8 @@
 The covariance of its residual (rotation, position, velocity, biases), shape (15, 15), is kept apart: a smoother has the
 square-root information instead.
 
-What a motion says of the states at its ends is an array of shape (15, `WIDTH`): columns of the state before it, the
-residual in column `RESIDUAL`, columns of the state after it from `AFTER` on, and one that stays zero.
+The linearised factor between the states at its ends is an array of shape (15, `WIDTH`): columns of the state before it,
+the residual in column `RESIDUAL`, columns of the state after it from `AFTER` on, and one that stays zero.
 """
 
 import numpy as np

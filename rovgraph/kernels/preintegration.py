@@ -20,9 +20,8 @@ so the covariance becomes F P F' + Q, and the derivative H of zeta by the bias o
 Between two samples both signals are taken as linear. The step above turns the specific force with the attitude at
 its beginning; rotating it by half the step's turn first makes the integration second order.
 
-What IMU samples around a keyframe say beyond their integral: rate, mean, gaps and noise.
-
-Samples are a table of shape (m, 7): time, specific force, rate, body axes.
+Beside the integral, IMU samples around a keyframe give its angular rate, their mean, gaps and noise. Samples are a
+table of shape (m, 7): time, specific force, rate, body axes.
 """
 
 import math
@@ -329,7 +328,7 @@ def first_not_before(imu: Array, time: float) -> int:
 def fit_rate(imu: Array, time: float, rate_out: Array) -> tuple[float, float]:
     """Rate at a time, of a parabola through the samples within `HALF_WINDOW_S` of it, if they are enough.
 
-    Through fewer a parabola says too little; then it is interpolated between the two around it. The lever arm turns
+    With fewer samples a parabola is too uncertain; then the rate is interpolated. The lever arm turns
     the noise of the rate into velocity, and the derivative by the misalignment into knowledge that is not there, so a
     single sample would not do.
 

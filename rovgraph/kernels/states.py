@@ -1,4 +1,4 @@
-"""States as kernels take them: that of one epoch, and those of many."""
+"""States as kernels take them: of one epoch, and of many."""
 
 from typing import NamedTuple
 

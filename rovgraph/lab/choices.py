@@ -1,4 +1,4 @@
-"""What a person gives to a study of the calibration: names, goals, what is known already."""
+"""Options of a study of the calibration: names, goals, known components."""
 
 import difflib
 import json
@@ -18,7 +18,7 @@ def listed(names: str | Iterable[str] | None) -> list[str]:
 
     Raises
     ------
-    InputError : something that is no name
+    InputError : an entry that is not a name
     """
     each = names.split(",") if isinstance(names, str) else [*(names or ())]
     if wrong := [name for name in each if not isinstance(name, str)]:
@@ -70,7 +70,7 @@ def _goal(text: str) -> tuple[str, float]:
 
 
 def read_known(path: Path) -> KnownComponents:
-    """What the ``observability.json`` of a dive says.
+    """Known components from the ``observability.json`` of a dive.
 
     Raises
     ------

@@ -1,15 +1,10 @@
-"""Any set of estimators on any set of dives: what ``rovgraph compare`` does.
+"""Any set of estimators on any set of dives: the work of ``rovgraph compare``.
 
-From a row per run and estimator to a row per estimator.
-
-The mean NEES of N independent runs at their ends, 2 components each, is chi-square with
-2 N degrees of freedom over N for covariances that are right (Bar-Shalom et al. 2001, 5.4.2). Along a
-track errors are correlated, so the mean there has no such band.
-
-The measures of one estimate against a reference: a row of runs.csv.
-
-Position errors and their consistency are those of `rovgraph.evaluate`, at the reference's
-epochs; docs/compare.md says what each column means.
+`measures` makes a row of runs.csv from one estimate and a reference: position errors and their consistency are those of
+`rovgraph.lab.evaluate`, at the reference's epochs; docs/compare.md describes the columns. `aggregate` makes a row per
+estimator of these rows. The mean NEES of N independent runs at their ends, 2 components each, is chi-square with 2 N
+degrees of freedom over N for covariances that are right (Bar-Shalom et al. 2001, 5.4.2). Along a track errors are
+correlated, so the mean there has no such band.
 """
 
 import math
@@ -76,12 +71,12 @@ def _summary(named: EstimatorSpec, runs: pd.DataFrame) -> dict[str, Any]:
 
 
 def _rms(values: pd.Series) -> float:
-    """Root of the mean of the squares, NaN where there are none."""
+    """Root of the mean of the squares, NaN without any."""
     return float(np.sqrt(values.pow(2).mean()))
 
 
 def nees_band(runs: int) -> tuple[float, float]:
-    """Within which the mean NEES of two components lies with 95 %, over independent runs."""
+    """The 95 % band of the mean NEES of two components, over independent runs."""
     low, high = (2.0 * float(gammaincinv(runs, p)) / runs for p in ((1.0 - BAND) / 2.0, (1.0 + BAND) / 2.0))
     return low, high
 
@@ -299,7 +294,7 @@ def compare(
     """Run estimators on dives, in parallel, and measure them.
 
     The result does not depend on ``jobs``, the time it took aside. An estimator that fails
-    on a run has a row that says why.
+    on a run has a row with the reason.
 
     Parameters
     ----------

@@ -1,16 +1,12 @@
-"""The estimators by name, for whoever compares them.
+"""All estimators by name, as chains of stages, and how those of one dive or of many are run.
 
-Headings, as the thesis letters them: a = magnetometer and the DVL's compass, b = the
-DVL's compass, c = the magnetometer.
+The first stage of a chain takes a log and a configuration, each of the others the result of the stage before.
+Estimators whose chains begin alike share those results (filter and smoother of one pass, everything that needs the same
+keyframes), those of one configuration the search for faulty intervals, and each is charged the time of its whole chain.
+The thesis's filters of one kind, which have no chain, run side by side over all dives, and each is charged its share of
+the time, by the seconds of its log.
 
-Estimators as chains of stages, and how those of one dive or of many are run.
-
-The first stage of a chain takes a log and a configuration, each of the others what the stage
-before made. Estimators whose chains begin alike share what those stages made (filter and
-smoother of one pass, everything that needs the same keyframes), those of one configuration the
-search for stretches of wrong measurements, and each is charged for the whole of its chain. The
-thesis's filters of one kind, which have no chain, run side by side over all dives, and each is
-charged for its share of that, by the seconds of its log.
+Headings have the thesis's letters: a = magnetometer and the DVL's compass, b = the DVL's compass, c = the magnetometer.
 """
 
 import difflib
@@ -40,7 +36,7 @@ SHORTEST_S = 1e-3  # for which a log counts where time is shared
 
 @dataclass(frozen=True)
 class ChainTask:
-    """What the first stage of a chain takes.
+    """Input of the first stage of a chain.
 
     Attributes
     ----------
@@ -59,7 +55,7 @@ class EstimatorSpec:
 
     Attributes
     ----------
-    name : key of `rovgraph.lab.estimators.ESTIMATORS`
+    name : key of `ESTIMATORS`
     family : "dead reckoning", "thesis", "error state", "graph", "isam2"
     about : one line of what it is
     headings : "a", "b", "c", or "" for those of the configuration
@@ -122,7 +118,7 @@ class EstimatorSpec:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an estimator on one log.
+    """Result of an estimator on one log.
 
     Attributes
     ----------
@@ -318,7 +314,7 @@ def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stag
 
 
 def _driven(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> EstimatorSpec:
-    """An estimator that knows thrusters and drag, with both headings."""
+    """An estimator with thrusters and drag, and both headings."""
     name, words = f"{kind}-hydrodynamics", f"{about}, {_WITH['a']}, thrusters and drag"
     return EstimatorSpec(name, family, words, "a", False, smoothing, (assembled, *stages), hydrodynamics=True)
 

@@ -1,9 +1,9 @@
-"""How far a trajectory is from a reference.
+"""Errors of a trajectory against a reference.
 
 The trajectory is interpolated to the reference's epochs. Errors are estimate minus
-reference, in n. Nothing is aligned unless asked for: both are taken to be in the same
-frame, which is what a navigator needs to know. With ``align`` a turn about down and a shift
-in the horizontal (least squares, Umeyama 1991 without scale) are taken out first.
+reference, in n. By default both are taken to be in the same frame, since a navigator needs absolute
+errors. With ``align`` a turn about down and a shift in the horizontal (least squares, Umeyama 1991
+without scale) are removed first.
 
 Consistency uses the normalised error e' P^-1 e of north and east, which is chi-square with
 two degrees of freedom (mean 2) for a P that is right.
@@ -191,7 +191,7 @@ def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[s
 
     Returns
     -------
-    Trajectory, and what was taken out, by the names of `Metrics`
+    Trajectory, and the turn and shift that were removed, by the names of `Metrics`
     """
     mean_e, mean_t = estimate.p_n[:, :2].mean(axis=0), truth.p_n[:, :2].mean(axis=0)
     e, t = estimate.p_n[:, :2] - mean_e, truth.p_n[:, :2] - mean_t

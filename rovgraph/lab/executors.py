@@ -1,11 +1,9 @@
-"""Where the runs of a study are made: on this machine, or on a Dask cluster.
+"""Executors of a study's runs: a pool of processes on this machine, or a Dask cluster.
 
-On one machine a pool of processes is all that is needed; it is at hand without another
-library, starts in a second and uses no ports. What a pool lacks is done here: when one of its
-processes is killed, it breaks as a whole and is made again. A cluster's scheduler does that by
-itself, so for more than one machine there is Dask, and nothing of it is repeated here.
-
-Work spread over the machine's cores, in processes that end when they are no longer wanted.
+On one machine a pool of processes suffices; it needs no other library, starts in a second and uses no ports. When one
+of its processes is killed, a pool breaks as a whole: `Local` makes it again. A cluster's scheduler does that by itself,
+so for more than one machine there is Dask. `in_workers` spreads work over the machine's cores, in processes that end
+with it.
 """
 
 import contextlib
@@ -53,7 +51,7 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
     InputError : a process was killed from outside, or none could start
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker, which imports the caller's script
-        sys.exit(1)  # quietly: the caller says why
+        sys.exit(1)  # quietly: the caller reports why
     before = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")
     started = context.Event()
@@ -177,7 +175,7 @@ WORKERS_S = 30.0  # for the first worker to join it
 
 
 class Executor(Protocol):
-    """Calls a function with every task, elsewhere, and ``finished`` here with what came of each.
+    """Calls a function with every task, elsewhere, and ``finished`` here with the result of each.
 
     A task that raises, or whose process dies, is tried again; after `RETRIES` of that
     ``finished`` is given the error.
@@ -202,7 +200,7 @@ class Local:
             raise InputError(f"{self.jobs} jobs: at least 1 is expected")
 
     def each(self, function: Callable[[Task], Result], tasks: Sequence[Task], finished: Finished) -> None:
-        """As `Executor`: after a process was killed, what it may have had at hand goes first, each by itself."""
+        """As `Executor`: after a process was killed, the tasks that it may have had come first, each by itself."""
         jobs, failures = self.jobs or cores(), dict.fromkeys(range(len(tasks)), 0)  # of what is not finished yet
         work = _Work(function, tasks, finished, failures)
         while failures:
@@ -213,7 +211,7 @@ class Local:
 
 @dataclass(frozen=True)
 class _Work:
-    """Tasks, and how often each that is left has failed; what is finished is taken out of ``failures``."""
+    """Remaining tasks, and how often each has failed; finished ones are removed from ``failures``."""
 
     function: Callable[[Any], Any]
     tasks: Sequence[Any]
@@ -238,7 +236,7 @@ class _Work:
         return self._killed(sorted(lost)[:jobs]) if lost else []
 
     def _killed(self, at_hand: list[int]) -> list[int]:
-        """A pool takes tasks in their order, so the first of the lost ones were at hand."""
+        """A pool takes tasks in their order, so the first of the lost ones were running."""
         message = "a worker process was killed (out of memory?); its task is done again"
         warn(message)
         if len(at_hand) == 1:
@@ -328,7 +326,7 @@ class Cluster:
 
 
 def _hush(*libraries: str) -> None:
-    """Keep libraries from logging what we say in a line of our own, tracebacks among it."""
+    """Keep libraries from logging errors, with tracebacks, that are reported in one line here."""
     for name in [*libraries, *logging.root.manager.loggerDict]:
         if name.split(".")[0] in libraries:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)

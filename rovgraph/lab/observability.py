@@ -1,12 +1,11 @@
-"""What of the calibration a dive can show: what ``rovgraph observe`` does.
+"""Observability of the calibration in a dive: the work of ``rovgraph observe``.
 
-From the graph's own information matrix: states are marginalised exactly, by QR, and what
-noise in the estimate feigns, the spurious information, is removed (`rovgraph.inference.observability`).
+From the graph's own information matrix: states are marginalised exactly, by QR, and the spurious
+information of noise in the estimate is removed (`rovgraph.inference.observability`).
 
-Directions of the calibration that a dive leaves open, and the same in words.
-
-An eigenvector of the information, in units of the prior's sd, is a combination of components
-that the data see by itself; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
+`directions` finds the directions of the calibration that a dive leaves open; `in_words` describes them. An eigenvector
+of the information, in units of the prior's sd, is a combination of components that the data determine independently of
+the others; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
 """
 
 import difflib
@@ -44,7 +43,7 @@ OTHER_LABELS = (
 
 @dataclass(frozen=True)
 class Observability:
-    """What a dive shows of its calibration; c scalar components that are estimated.
+    """Observability of the calibration in a dive; c scalar components that are estimated.
 
     Attributes
     ----------
@@ -127,7 +126,7 @@ def joint_bits(information: Array) -> float:
 
 
 def observe(log: Log, config: Config, also: Sequence[str] = (), progress: Progress = no_progress) -> Observability:
-    """What a recorded dive shows of the calibration.
+    """Observability of the calibration in a recorded dive.
 
     Parameters
     ----------
@@ -181,7 +180,7 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
             f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
         )
     dive = batch.optimum()
-    # what is not estimated because noise would move it is what is to be looked at
+    # shows constants that are not estimated because noise would bias them
     moved = [name for name in dive.unknowns.considered if dive.beliefs[name].estimate]
     dive = dive.estimating(moved) if moved else dive
     if not dive.unknowns.estimated:
@@ -192,7 +191,7 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
 
 
 def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progress = no_progress) -> Observability:
-    """What a solved dive shows of the calibration.
+    """Observability of the calibration in a solved dive.
 
     Parameters
     ----------
@@ -265,7 +264,7 @@ def directions(information: Array) -> Directions:
 
 
 def in_words(information: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> list[str]:
-    """What cannot be known, a sentence each; where all can be, the weakest direction.
+    """Unobservable directions, a sentence each; where all are observable, the weakest one.
 
     Parameters
     ----------
@@ -295,7 +294,7 @@ def in_words(information: Array, labels: Sequence[str], units: Sequence[str], pr
 def _apart(axes: Array) -> Array:
     """Directions, shape (k, c), that span the same as k given ones, of as few components each as elimination leaves.
 
-    Axes of nearly one eigenvalue are any mixture of each other, and would tell the same twice.
+    Axes of nearly one eigenvalue are any mixture of each other, and would repeat each other.
     """
     if len(axes) < 2:
         return axes
@@ -310,7 +309,7 @@ def _parts(axis: Array) -> list[int]:
 
 
 def _combination(axis: Array, labels: Sequence[str], units: Sequence[str], prior_sd: Array) -> str:
-    """What may change along an open direction, and what that leaves known."""
+    """Components that change along an open direction, and those that stay determined."""
     parts = _parts(axis)
     names, change = [labels[i] for i in parts], axis[parts] * prior_sd[parts]
     if len(parts) == 1:

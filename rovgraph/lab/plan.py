@@ -1,10 +1,8 @@
-"""What to drive to know the calibration: what ``rovgraph plan`` does.
+"""Ranks manoeuvres by how well they determine the calibration: the work of ``rovgraph plan``.
 
-The information of a dive depends on where it is linearised, not on the noise that comes. So a
-manoeuvre is driven without noise by a vehicle with the believed sensors, the graph is
-linearised there, and what is known already is added.
-
-Manoeuvres to choose from: scenarios of the simulator, each at some speeds.
+The manoeuvres are scenarios of the simulator, each at some speeds. The information of a dive depends on where it is
+linearised, not on the noise. So a manoeuvre is simulated without noise for a vehicle with the configured sensors, the
+graph is linearised there, and the information that you already have is added.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -65,7 +63,7 @@ def _number(speed: str, text: str) -> float:
 
 
 IMU_HZ, DVL_HZ = (5.0, 1000.0), (0.1, 50.0)  # rates that can be planned with
-MOST_COLUMNS = 6  # of a table, where no goal says what matters
+MOST_COLUMNS = 6  # of a table, without goals
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class SensorRates:
 
 @dataclass(frozen=True)
 class KnownComponents:
-    """What is known of some components already.
+    """Prior information on some components.
 
     Attributes
     ----------
@@ -117,7 +115,7 @@ class KnownComponents:
         return KnownComponents((), np.zeros((0, 0)), np.zeros(0))
 
     def information(self, labels: Sequence[str], sd: Array) -> Array:
-        """What its data say of some components, shape (c, c), in units of ``sd``; what it also knew is marginalised."""
+        """Information of its data on some components, shape (c, c), in units of ``sd``; the others are marginalised."""
         both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in labels]
         out = np.zeros((len(labels), len(labels)))
         if both:
@@ -129,7 +127,7 @@ class KnownComponents:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a manoeuvre would show.
+    """Predicted observability of a manoeuvre.
 
     Attributes
     ----------
@@ -191,7 +189,7 @@ def plan(
 
     Parameters
     ----------
-    config : what is believed of vehicle and sensors, and what is to be estimated
+    config : vehicle and sensors as configured, and what to estimate
     candidates : the manoeuvres
     duration : of each [s]
     known : from dives before
@@ -237,12 +235,12 @@ def _check(goals: Mapping[str, float], estimated: Sequence[str]) -> None:
 
 
 def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
-    """A manoeuvre in calm water: what waves would teach nobody can promise."""
+    """A manoeuvre in calm water: the information from waves cannot be planned."""
     return scenario(manoeuvre.name, duration, manoeuvre.speed, Style(waves=CALM))
 
 
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
-    """What a manoeuvre would show by itself."""
+    """Predicted observability of a manoeuvre by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
     own = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
     truth = Truth(

@@ -1,4 +1,4 @@
-"""What a study runs its estimators on: a recorded dive, or one that is simulated where it is needed."""
+"""Dives for the runs of a study: recorded, or simulated where they are needed."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -82,7 +82,7 @@ class Simulated:
         return f"{self.scenario} {self.seed}"
 
     def load(self) -> Case:
-        """The dive, and what an estimator may know of it.
+        """The dive, and the configuration for an estimator.
 
         Raises
         ------

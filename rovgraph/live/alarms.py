@@ -1,8 +1,8 @@
-"""Alarms while a dive goes on: the statistics of `rovgraph.diagnosis` on what the filter has met lately.
+"""Alarms while a dive goes on: the statistics of `rovgraph.diagnosis`, of the filter's last minute.
 
-Looked at are keyframes that the lag has passed. Rejections and mean squares of innovations are those of the last
-minute. One innovation of each sensor and keyframe, the first, enters the statistic of lasting errors: between keyframes
-they are independent where the filter is right, within one they share the error of its prediction.
+They use keyframes that are older than the lag. Rejections and mean squares of innovations are those of the last
+minute. The first innovation of each sensor and keyframe enters the statistic of correlated noise: between keyframes
+innovations are independent where the filter is right, within one they share the error of its prediction.
 """
 
 from collections import deque
@@ -65,9 +65,9 @@ class _Raised:
 
 @dataclass
 class LiveAlarms:
-    """Says once that an alarm begins, or becomes worse, and once that it is over.
+    """Reports once that an alarm begins, or becomes worse, and once that it is over.
 
-    One that comes and goes is in the verdict while it is there, and is not said again unless it is worse than it was.
+    One that comes and goes is in the verdict while it is there, and is reported again only if it is worse than it was.
 
     Attributes
     ----------
@@ -151,14 +151,14 @@ class LiveAlarms:
             self._counts.append({})
 
     def reinitialised(self, adopted: Adopted) -> None:
-        """The filter goes on from the smoothed dive so far."""
+        """The filter continues from the smoothed dive so far."""
         time = float(adopted.smoothed.time[-1])
         if not np.isnan(self._start):
             self._told += [(time, one) for one in separation_of(adopted.smoothed, adopted.filtered, self._start)]
         self._shown = adopted.shown
 
     def forget_smoothed(self) -> None:
-        """Another filter goes on: what the smoothed dive has shown is not of its sensors and priors."""
+        """Another filter continues: the smoothed dive's findings do not hold for its sensors and priors."""
         self._shown = []
 
     def taken_out(self, stretch: FaultyInterval) -> None:
@@ -206,7 +206,7 @@ class LiveAlarms:
     def _look_at_lasting(
         self, engine: FilterEngine, time: float, samples: dict[str, list[tuple[Met, int, Array]]]
     ) -> Iterator[list[Statistic]]:
-        """What residuals of the last minute show, sensor by sensor; before the last one, what is known so far."""
+        """Statistics of the last minute's residuals, one sensor a step: until the last item the previous ones."""
         self._pieces.append({})
         begin, found = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces)), list[Statistic]()
         for sensor in [sensor for sensor in samples if sensor != PLACE]:
@@ -246,7 +246,7 @@ class LiveAlarms:
                 self._say_once(key, time, "over", f"{key[1]}: {key[0]}: within its limits for {OVER_S:g} s")
 
     def _renewed(self, before: Alarm, now: Alarm, time: float) -> Alarm:
-        """An alarm that goes on: as it was at its worst, or with the figures that the smoothed dive has now."""
+        """An alarm that lasts: as it was at its worst, or with the figures that the smoothed dive has now."""
         if now.kind in ("held", "unstated"):
             if now.text != before.text:
                 self._say(time, now.sensor, now.severity, now.text)
@@ -265,7 +265,7 @@ class LiveAlarms:
 
 
 def _innovations(engine: FilterEngine, sensor: str, samples: list[tuple[Met, int, Array]]) -> SensorResiduals:
-    """Innovations in units of their sd: along those in units of the noise, and as long as the NIS says."""
+    """Innovations in units of their sd: along those in units of the noise, and as long as the NIS."""
     problem = gathered([(met.problem, met.begin + k) for met, k, _ in samples])
     block = engine.measurements(problem, np.arange(len(samples)))
     x, c, nis, weight = (

@@ -1,20 +1,19 @@
-"""Many clocks become one.
+"""Converts the stamps of all sources to the estimator's clock.
 
-The estimator's time is that of the clock that stamps the IMU. Any other clock is compared
-with it by way of the host's: the least delay between a message's leaving and its arrival, of the
-last minute, is taken for the transport, which is the same for all. An instrument that says when it
-sent a message, too, has its processing taken off, so that only the transport is left; of others the
-stamp stands for the leaving. Two clocks that agree from the start within `AGREE_S` (`AGREE_SENT_S` where
-the transport alone is left) are taken for synchronised, and their stamps believed to the
-millisecond; what they drift apart later is put right. Clocks that do not agree (seconds since
-switching on, say) are shifted by the difference of their least delays.
+The estimator's time is that of the clock that stamps the IMU. Any other clock is compared with it through the host's:
+the least delay between a message's sending and its arrival, of the last minute, is taken as the transport delay, which
+is the same for all. Where an instrument also reports when it sent a message, its processing time is subtracted, so that
+only the transport delay remains; for others the stamp counts as the time of sending. Two clocks that agree from the
+start within `AGREE_S` (`AGREE_SENT_S` where only the transport delay remains) are taken as synchronised, and their
+stamps as accurate to the millisecond; later drift is corrected. Clocks that do not agree (seconds since switching on,
+say) are shifted by the difference of their least delays.
 
-The stamps of recordings are believed. Those of another epoch than the IMU's are shifted by the recorded arrivals, and
-refused where these do not tell.
+The stamps of recordings are used unchanged. Stamps of another epoch than the IMU's are shifted by the recorded
+arrivals, and refused without them.
 
-A stamp that is suddenly seconds off is left out. When the stamps go on like that, the clock
-was set: it is shifted, so that time goes on. A counter that wraps goes on at once. Stamps that stand
-still for `STILL_S` while messages come are not used any more: arrivals are, until the stamps move on.
+A stamp that is suddenly seconds off is left out. When the following stamps agree with it, the clock was set: it is
+shifted, so that time is continuous. A counter that wraps is continued at once. Stamps that stand still for `STILL_S`
+while messages arrive are replaced by the arrivals, until the stamps move on.
 """
 
 from collections import deque
@@ -105,13 +104,13 @@ class Clocks:
     _base: _Clock | None = None
 
     def time(self, message: Message) -> float | None:
-        """Of a message's measurements [s]; None = not to be known, leave it out.
+        """Of a message's measurements [s]; None = unknown, leave it out.
 
         A message of a source without a clock is as old as the IMU's newest at its arrival.
 
         Raises
         ------
-        InputError : recordings whose clocks are of different epochs, and whose arrivals do not tell by how much
+        InputError : recordings whose clocks are of different epochs, and whose arrivals do not give the shift
         """
         if message.stamp is None:
             return message.arrival if self._base is None else message.arrival - self._base.delay.value
@@ -134,11 +133,11 @@ class Clocks:
         return stamp + self._correction(clock, AGREE_S if message.latency is None else AGREE_SENT_S)
 
     def now(self, host: float) -> float | None:
-        """The estimator's time at a time of the host's clock; None before the IMU has been heard, and in a replay."""
+        """The estimator's time at a time of the host's clock; None before the first IMU sample, and in a replay."""
         return None if self.trust or self._base is None else host - self._base.delay.value
 
     def state(self) -> dict[str, Any]:
-        """What it has learnt of the clocks, as plain values."""
+        """State of the clocks, as plain values."""
         return {
             "base": None if self._base is None else self._base.name,
             "clocks": [
@@ -148,7 +147,7 @@ class Clocks:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Know what another has learnt."""
+        """Take over what another has learnt."""
         for known in state["clocks"]:
             delay = _LeastDelay()
             delay.pieces.extend((arrival, least) for arrival, least in known["delay"])
@@ -158,7 +157,7 @@ class Clocks:
                 self._base = clock
 
     def _unwrapped(self, stamp: float, clock: _Clock) -> float:
-        """A stamp, of a counter that goes on where it wraps; of a late message from before that, less its range [s]."""
+        """A stamp, continued where a counter wraps; of a late message from before that, less its range [s]."""
         newest = stamp if clock.newest is None else clock.newest
         if late := counter_range(stamp, newest):
             return stamp - late

@@ -1,25 +1,17 @@
-"""What a run of the online mode has on disk, so that a crash loses no more than a second.
+"""Files of a run of the online mode: recording, checkpoint and track, so that a crash loses no more than a second.
 
-The state of a running estimate on disk, so that it goes on after a crash.
+`Recorder` writes all received data as a log that ``rovgraph smooth`` reads. Rows are in the order of arrival, which the
+last column, ``received``, holds. Cells hold the shortest decimals that give the same number again, so that a replay
+gets the same values as the live run. `Recorder.write` only formats and queues. One thread hands rows to the operating
+system, so that a crash of the program loses no more than `FLUSH_S`; another has them put on the disk, which may take
+seconds on a memory card.
 
-A file is one line of text, ``rovgraph checkpoint VERSION DIGEST``, and a body to which the
-digest (SHA-256) belongs: the length of a JSON text in 8 bytes, little-endian; that text, in
-which an array stands as ``{"$array": [dtype, shape, offset]}``; the arrays' bytes. Nothing in
-it can run code when it is read.
+`Keeper` writes a checkpoint, the state of the running estimate, once a second without delaying the estimate;
+``--resume`` continues from it. Its file is one line of text, ``rovgraph checkpoint VERSION DIGEST``, and a body to
+which the digest (SHA-256) belongs: the length of a JSON text in 8 bytes, little-endian; that text, in which an array
+stands as ``{"$array": [dtype, shape, offset]}``; the arrays' bytes. Reading it cannot run code.
 
-Checkpoints once a second, without holding up the estimate.
-
-Everything that was received, as a log that ``rovgraph smooth`` reads.
-
-Rows stand in the order of arrival; the last column, ``received``, tells that to whoever reads
-the log. Cells hold the shortest decimals that give the same number again, so that a replay
-sees what was seen live.
-
-`Recorder.write` only formats and queues. One thread hands rows to the operating system, so
-that a crash of the program loses no more than `FLUSH_S`; another asks for them to be put on
-the disk, which may take seconds on a memory card.
-
-The filtered trajectory, written while it grows.
+`TrackFile` appends the filtered trajectory as it grows.
 """
 
 import contextlib
@@ -183,7 +175,7 @@ class Keeper:
     Parameters
     ----------
     path : of the checkpoint
-    warnings : told from that thread where it cannot be written; it goes on trying
+    warnings : receives, from that thread, that it cannot be written; it keeps trying
     """
 
     def __init__(self, path: Path, warnings: Warnings) -> None:
@@ -238,8 +230,8 @@ class Recorder:
 
     Parameters
     ----------
-    path : a new file, or a recording to go on with; its last line is dropped where it was cut off
-    warnings : told, from other threads too, of what goes wrong later
+    path : a new file, or a recording to continue; its last line is dropped where it was cut off
+    warnings : receives later errors, from other threads too
 
     Attributes
     ----------
@@ -391,7 +383,7 @@ class TrackFile:
 
     Parameters
     ----------
-    path : new, or to go on with
+    path : new, or to continue
     until : keep rows of an older file up to this time [s]; the rest comes again
 
     Raises
@@ -457,24 +449,24 @@ LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 
 @dataclass
 class Files:
-    """What is on disk of a run, so that a crash loses no more than a second.
+    """Files of a run, so that a crash loses no more than a second.
 
     Parameters
     ----------
     folder : an existing one
     config : as the user gave it
     warnings : where trouble with the disk goes
-    resume : go on with what is there
+    resume : continue with what is there
     replayed : from the recording alone, not from the checkpoint
 
     Attributes
     ----------
-    state : the checkpoint that is resumed; None where there is none
+    state : the checkpoint that is resumed; None without one
     received : what had been received after it; None where there is nothing
 
     Raises
     ------
-    InputError : the folder cannot be written, or holds nothing to go on with, or a recording that cannot be read
+    InputError : the folder cannot be written, or holds nothing to continue, or a recording that cannot be read
     """
 
     folder: Path
@@ -580,7 +572,7 @@ class Files:
         return True
 
     def finish(self, navigator: Navigator) -> None:
-        """Put the end of the track on disk; the checkpoint stays where it was, from there one may go on."""
+        """Put the end of the track on disk; a run can still be resumed from the checkpoint."""
         if navigator.engine is not None:
             self._add(navigator, navigator.engine)
 
@@ -590,13 +582,13 @@ class Files:
 
 
 class KnownSources(dict[str, float]):
-    """What sources have found out and a resumed run goes on with, such as the pressure at the surface, in a file.
+    """Values that sources have found and a resumed run needs, such as the pressure at the surface, in a file.
 
     Parameters
     ----------
     folder : of the run; None = it is not kept
-    resume : go on with what is there
-    warnings : told where it cannot be written
+    resume : continue with what is there
+    warnings : receives that it cannot be written
     """
 
     def __init__(self, folder: Path | None, resume: bool, warnings: Warnings) -> None:

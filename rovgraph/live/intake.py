@@ -1,8 +1,7 @@
-"""From what a source says to measurements as the estimator takes them.
+"""From readings to measurements for the estimator: preprocessing, the first seconds, and late sensors.
 
-The first seconds: what an estimator has to know before it can begin.
-
-Sensors that begin after the first seconds: the filter goes on with what they need in its state.
+`Intake` applies the calibration that an estimator expects. `Startup` collects the first seconds until the estimator has
+its initial conditions. Sensors that begin later join: the filter continues with their calibration in its state.
 """
 
 import math
@@ -77,7 +76,7 @@ class Intake:
     Attributes
     ----------
     origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
-    news : (sensor, text) to be told, since they were last taken
+    news : (sensor, text) to be reported, since they were last taken
     """
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
@@ -89,7 +88,7 @@ class Intake:
         self.news: list[tuple[str, str]] = []
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
-        self._unknown: set[str] = set()  # columns of which that is told
+        self._unknown: set[str] = set()  # columns that are reported
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -193,7 +192,7 @@ class Startup:
 
     @property
     def expects(self) -> str:
-        """What has to come before the dive can begin, or be different."""
+        """Conditions for the dive to begin."""
         if self.waits_for:
             return self.waits_for
         if self._next is None:
@@ -219,7 +218,7 @@ class Startup:
         return self.begin(origin)
 
     def begin(self, origin: tuple[float, float] | None) -> InitialConditions | None:
-        """The beginning from what is there, or None; then `waits_for` says why."""
+        """The beginning from what is there, or None; then `waits_for` has the reason."""
         self.measurements.sort(key=lambda m: (m.time, precedence(m.sensor)))
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
         if not imu:
@@ -241,32 +240,32 @@ class Startup:
         return initial
 
 
-LATE = ("dvl_water", "thruster")  # who has none shall not pay for a current in the filter's state
-ANYWHERE_M = 1e4  # sd of where a dive began that knows no fix
+LATE = ("dvl_water", "thruster")  # without them the filter's state needs no current
+ANYWHERE_M = 1e4  # sd of the start of a dive without a fix
 
 
 def is_late(m: Measurement, engine: FixedLag) -> bool:
-    """Whether a measurement is of a sensor that the configuration has and the filter does not know."""
+    """Whether a measurement is of a sensor that the configuration has and the filter does not."""
     if m.sensor not in LATE or m.sensor in engine.initial.instruments:
         return False
     return m.sensor != "thruster" or engine.initial.config.graph.hydrodynamics
 
 
 def can_join(m: Measurement, engine: FixedLag) -> bool:
-    """Whether the filter can go on with its sensor from this measurement on."""
+    """Whether the filter can continue with its sensor from this measurement on."""
     as_many = m.sensor != "thruster" or len(m.values) == len(engine.initial.config.vehicle.thrusters)
     return as_many and bool(engine.snapshots) and bool(np.isfinite(m.values[:3]).all())
 
 
 def joined(engine: FixedLag, sensor: str) -> FixedLag:
-    """A filter that goes on with one sensor more."""
+    """A filter that continues with one sensor more."""
     initial = engine.initial
     more = instruments(initial.config, initial.config.imu.lever_arm_m)[sensor]
     return engine.continued(replace(initial, instruments={**initial.instruments, sensor: more}))
 
 
 def unlocated(engine: FixedLag) -> FixedLag:
-    """A filter that goes on not knowing where it is, nor where it began: fixes will say."""
+    """A filter that continues with unknown position and start, which fixes will determine."""
     initial = engine.initial
     p_sd = np.append(np.full(2, ANYWHERE_M), initial.prior.p_sd[2])
     wide: InitialConditions = replace(initial, prior=replace(initial.prior, p_sd=p_sd))

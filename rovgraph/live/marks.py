@@ -1,6 +1,6 @@
-"""Marks and way-points that a person drops while a dive goes on.
+"""Marks, way-points and a person's commands while a dive goes on.
 
-What a person says to a dive that goes on. Commands come through the feed, between messages of the sources.
+Commands arrive through the feed, between messages of the sources.
 """
 
 import csv
@@ -55,7 +55,7 @@ class Marks:
     ----------
     folder : of the results; None = they are kept in memory
     warnings : where trouble with the disk goes
-    resume : go on with the marks that are there
+    resume : keep the marks that are there
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Marks:
         self._newest = max((mark.number for mark in self.all), default=0)
 
     def drop(self, name: str, at: Solution, north: float | None = None, east: float | None = None) -> Mark:
-        """Add a way-point at a place [m], or a mark where a solution says that the vehicle is."""
+        """Add a way-point at a place [m], or a mark at the position of a solution."""
         self._newest += 1
         if north is not None and east is not None:
             mark = Mark(self._newest, "waypoint", name, at.time, north, east)
@@ -158,7 +158,7 @@ def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
 
 @dataclass(frozen=True)
 class Command:
-    """Something that a person wants done."""
+    """A person's command."""
 
 
 @dataclass(frozen=True)

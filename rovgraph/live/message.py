@@ -1,4 +1,4 @@
-"""What a source says at one time, and from the cells of a row to readings."""
+"""Messages from live sources, and parsing of log rows into readings."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class Reading(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What one source said at one time.
+    """The readings of one source at one time.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Message(NamedTuple):
     stamp : time of validity by the source's own clock [s], None where it has none
     readings : one per sensor
     clock : which of the source's clocks the stamp is from, where it has several
-    latency : time from validity to transmission, by the same clock [s]; None where the source does not say
+    latency : time from validity to transmission, by the same clock [s]; None if the source does not report it
     """
 
     source: str

@@ -1,7 +1,7 @@
-"""From messages to navigation solutions: everything of the online mode but its connections.
+"""From messages to navigation solutions: the online mode without its connections.
 
-A message's time is reconciled, its readings are looked at for faults, and go to the engine.
-`Navigator.solution` carries the newest keyframe on to the present with the IMU.
+A message's stamp is converted to the estimator's clock, its readings are screened for faults and passed to the filter.
+`Navigator.solution` propagates the newest keyframe to the present with the IMU.
 """
 
 import math
@@ -48,7 +48,7 @@ class Navigator:
     config : what is believed of vehicle and sensors
     patient : wait for the thread that smooths, so that a replay can be repeated
     reinitialise : the filter from the smoothed dive so far, now and then
-    smooth : have iSAM2 estimate the whole dive as it goes; the filter goes on from its newest keyframe
+    smooth : have iSAM2 estimate the whole dive as it goes; the filter continues from its newest keyframe
     clocks, faults, health, alarms : of the sources, of the sensors, and of the estimate
     isam2 : iSAM2, where it was asked for; it takes each keyframe that the lag has passed
     engine : None until the first seconds are over
@@ -106,7 +106,7 @@ class Navigator:
         return "" if self.engine is not None else self._startup.waits_for
 
     def waiting(self, sources: Sequence[str]) -> str:
-        """What the first solution waits for, and what each source has said so far; empty once there is an estimate.
+        """What the first solution waits for, and what each source has sent so far; empty once there is an estimate.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class Navigator:
         return (reading,)
 
     def _hear(self, message: Message) -> None:
-        """Note which sensors a source speaks of; the display's thread reads it, so it is replaced, not changed."""
+        """Note which sensors a source has; the display's thread reads it, so it is replaced, not changed."""
         known = self._heard.get(message.source, frozenset())
         if new := {r.sensor for r in message.readings} - known:
             self._heard = {**self._heard, message.source: known | new}
@@ -164,21 +164,21 @@ class Navigator:
             if measurement.time > known:
                 taken = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
                 if taken is not None:
-                    self._consider(taken, by_hand=taken.sensor == "fix")  # some may be; the recording does not tell
+                    self._consider(taken, by_hand=taken.sensor == "fix")  # some may be
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
 
     def say(self, source: str, kind: str, text: str) -> None:
-        """Have the next solution tell of an event."""
+        """Add an event to the next solution."""
         self._events.append(Event(self.time, source, kind, text))
 
     def lose_isam2(self, reason: str) -> None:
-        """Go on with the filter alone."""
+        """Continue with the filter alone."""
         self.isam2 = None
         self.say("isam2", "lost", reason)
 
     def tick(self, time: float) -> None:
-        """Time goes on, with measurements or without."""
+        """Advance the time, with measurements or without."""
         self.time = max(self.time, time)
         self.faults.tick(self.time)
 
@@ -232,7 +232,7 @@ class Navigator:
         )
 
     def state(self) -> dict[str, Any] | None:
-        """All that is needed to go on after a crash, as plain values and arrays; None before the beginning."""
+        """The state to continue from after a crash, as plain values and arrays; None before the beginning."""
         if self.engine is None or not self.engine.snapshots:
             return None
         return {
@@ -248,7 +248,7 @@ class Navigator:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from where another stood; the filter is not reinitialised any more."""
+        """Continue from the state of another; the filter is not reinitialised any more."""
         self._intake.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
         self.close()
         self._reinitialisations = None
@@ -263,13 +263,13 @@ class Navigator:
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
 
     def _consider(self, m: Measurement, by_hand: bool = False) -> None:
-        """Give a measurement, of a sensor or of a person, to the engine, unless it is none."""
+        """Screen one measurement, of a sensor or of a person, and pass it to the filter."""
         if m.time > self.time:
             self.time = m.time
         if m.sensor == "dvl_altitude":
             self._altitude = m.time, float(m.values[0])
         verdict = self.faults.accept(m) if by_hand else self.faults.look(m)
-        if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # the IMU's silence is seen by others that go on
+        if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # other sensors reveal an IMU outage
             self.faults.tick(self.time)
             self._ticked = self.time
         if verdict.retract_since is not None and self.engine is not None:
@@ -291,7 +291,7 @@ class Navigator:
             self._feed(self.engine, m)
 
     def _begin(self, initial: InitialConditions, state: Mapping[str, Any] | None = None) -> None:
-        """The first seconds are over, or an estimate goes on from its state."""
+        """The first seconds are over, or an estimate continues from its state."""
         config = initial.config
         if self.smooth:
             from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
@@ -338,7 +338,7 @@ class Navigator:
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
 
     def _joined(self, engine: FixedLag, m: Measurement) -> FixedLag | None:
-        """The filter that a measurement is for: one that knows its sensor; None where it cannot be used."""
+        """The filter that a measurement is for: one with its sensor; None where it cannot be used."""
         if is_late(m, engine):
             if self.smooth or not can_join(m, engine):
                 self._leave_unexpected(m.sensor)
@@ -366,7 +366,7 @@ class Navigator:
         return engine
 
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
-        """Have the filter go on from iSAM2's newest keyframe."""
+        """Have the filter continue from iSAM2's newest keyframe."""
         newest = self.passed[-1]
         if isam2.updated == newest.index:
             engine.adopt_passed(engine.filter.considering(isam2.known, newest.known), newest.gates)

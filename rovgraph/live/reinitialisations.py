@@ -1,7 +1,7 @@
-"""The filter goes on from the smoothed dive so far, which a thread computes while measurements come.
+"""Re-initialises the filter from the smoothed dive so far, which a thread computes while measurements arrive.
 
-The smoothed dive also shows what the filter cannot: constants that are held wrongly, and errors that last. It is
-examined as `rovgraph smooth` examines a whole dive, for alarms.
+The smoothed dive also shows wrong constants and errors that last, which the filter cannot show. It is examined for
+alarms, as `rovgraph smooth` examines a whole dive.
 """
 
 import time as host
@@ -40,7 +40,7 @@ FREED = 20  # keyframes, after each new one, once no re-initialisation needs the
 
 @dataclass(frozen=True)
 class Adopted:
-    """A keyframe from which the filter goes on.
+    """A keyframe from which the filter continues.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Reinitialisations:
     ----------
     patient : wait for the thread, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
-    adopted : what the filter goes on from, until it is taken
+    adopted : what the filter continues from, until it is taken
     waited : for the thread, which only a replay does that is faster than it [s]
     """
 
@@ -106,7 +106,7 @@ class Reinitialisations:
         return bool(self._due)
 
     def again(self) -> None:
-        """What is being smoothed is of no use to a filter that knows more sensors; begin it once more."""
+        """Start the smoothing again, for a filter with more sensors."""
         self._running = None
 
     def close(self) -> None:
@@ -120,7 +120,7 @@ class Reinitialisations:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def _begin(self, engine: FixedLag, dvl_contradicted: bool) -> None:
-        """Have the dive up to the oldest keyframe smoothed that the filter can go on from, if it is time to."""
+        """Have the dive up to the oldest keyframe smoothed that the filter can continue from, if it is due."""
         oldest, dive = engine.oldest(), engine.assembly.problem
         if oldest.time - float(dive.time[0]) < self._due[0]:
             return
@@ -130,7 +130,7 @@ class Reinitialisations:
         self._running = oldest.index, work
 
     def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
-        """Go on from the thread's result, if it is there; the keyframes that the lag has passed since are filtered."""
+        """Continue from the thread's result, if ready; the keyframes that the lag has passed since are filtered."""
         if not self.patient and not future.done():
             return
         began = host.perf_counter()
@@ -177,7 +177,7 @@ def _smoothed(
 def _shown(
     best: Optimum, initial: InitialConditions, before: list[Statistic], dvl_contradicted: bool
 ) -> list[Statistic]:
-    """What is held wrongly, or not stated, by the smoothed dive so far."""
+    """Constants at wrong values and unstated noise, by the smoothed dive so far."""
     begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     if end - begin < RULES["held"].from_s:
         return []

@@ -1,26 +1,23 @@
-"""Sensors that fail while they go on talking, or fall silent.
+"""Detects sensors that freeze, lose lock, contradict each other or stop sending, while a dive goes on.
 
-What is wrong is told by the rules of a log (`rovgraph.log.frozen`) from what came before: exact zeros although
-those before were too far from zero for the vehicle to have come there, and values that are held while it moves. Those
-are left out once the limits are passed, and what was used of them is taken back. Equal values that no working DVL or
-IMU gives wait until then. What disagrees with the estimate is the filter's to reject.
+`Faults` screens readings by the rules of a log (`rovgraph.log.frozen`), against earlier ones: exact zeros although
+those before were too far from zero for the vehicle to have come there, and values that are held while it moves. They
+are left out once the limits are passed, and the ones that were used are removed. Equal values that a working DVL or IMU
+never gives are held back until then. Readings that disagree with the estimate are left to the filter's gates.
 
-The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose axes or heading are wrong.
+`Crosscheck` compares the motion of the last minutes between sensors: which stamps are late, and which axes or heading
+are wrong. It repeats the comparisons of `rovgraph check`: acceleration by DVL and IMU, turning by compasses and gyro,
+the DVL's displacement and fixes, its vertical velocity and depth. A finding of some windows in a row is reported, and
+again after half an hour if it lasts, with its figures at that time.
 
-What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
-turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What some windows in a row say
-is said, and again after half an hour if it lasts, with the figures that it then has.
+`Health` is the state of each sensor, by the filter's innovations.
 
-How the sensors are, as the filter finds them.
-
-A DVL that contradicts the estimate again and again: a false lock, or water for the bottom.
-
-The filter lets a sensor in again that was out for its `readmit_s`, and moves to where that sensor sees it: right after
-a knock, wrong where the DVL has locked onto something else. A knock is over after one such return. A DVL that is
-rejected time and again is left out from its first rejection on, and again at once if it is rejected soon afterwards:
-the filter goes back to the keyframe before and takes all other measurements since once more. Its uncertainty is then
-that of the IMU without a DVL. A DVL that was never coherent is wrongly described rather than broken: it stays in use,
-and alarms say so.
+`Incoherence` finds a DVL that contradicts the estimate again and again: a false lock, or water for the bottom. The
+filter readmits a sensor after its `readmit_s`, and moves to the sensor's value: right after a knock, wrong where the
+DVL has locked onto something else. A knock is over after one such return. A DVL that is rejected repeatedly is left out
+from its first rejection on, and again at once if it is rejected soon afterwards: the filter goes back to the keyframe
+before and processes all other measurements since again. Its uncertainty is then that of the IMU without a DVL. A DVL
+that was never coherent is probably misconfigured, not broken: it stays in use, and alarms report it.
 """
 
 import math
@@ -49,26 +46,26 @@ from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
 from rovgraph.sensors.instruments import HEADING_STREAMS, heading_sources
 
 SILENT_AT_FIRST_S = 10.0  # after a first measurement, as long as the period is not known
-SELDOM_AT_FIRST_S = {"fix": 30.0}  # of sensors that speak less often
+SELDOM_AT_FIRST_S = {"fix": 30.0}  # of sensors that measure less often
 TELL_S = 2.0  # a ping without bottom lock is not worth an event, nor is a zero
 OFTEN, OFTEN_S = 10, 60.0  # so many times zeros in such a time are
 WAIT = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives, from which on they wait
-RECENT_VALUES = 100  # different ones of a sensor, that tell how it is
-AROUND_S = 30.0  # for which the IMU and the DVL are remembered, which tell of motion
+RECENT_VALUES = 100  # different ones of a sensor, for its state
+AROUND_S = 30.0  # for which the IMU and the DVL are kept, which show motion
 ASK_EVERY_S = 1.0  # whether values are held, while they are
 TURNS, TURNS_EVERY_S = 1000, 1.0  # rates of turn whose median is the gyro's bias
-OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
+OCCASIONAL = {"place"}  # sensors that measure only when there is something to see
 
 
 @dataclass(frozen=True)
 class Screening:
-    """What to do with a measurement.
+    """Decision on a measurement.
 
     Attributes
     ----------
     use : give it to the estimator
-    retract_since : take back the sensor's measurements from then on [s], as they wait or are none, or None
-    reason : why it is not used; empty = the sensor's state says it
+    retract_since : take back the sensor's measurements from then on [s], as they wait or are invalid, or None
+    reason : why it is not used; empty = the sensor's state shows it
     count : measurements that are left out by this, those taken back too; none while they wait
     late : measurements before it that waited, and are to be used after all
     """
@@ -86,7 +83,7 @@ _time = attrgetter("time")
 
 @dataclass
 class Watch:
-    """What is remembered of one sensor.
+    """Recent measurements and state of one sensor.
 
     Attributes
     ----------
@@ -107,13 +104,13 @@ class Watch:
     until: float = 0.0  # and of the last [s]
     equal: int = 0
     runs: deque[tuple[Array, int, float, float]] = field(default_factory=lambda: deque(maxlen=RECENT_VALUES))  # before
-    held: bool = False  # the equal values are none
+    held: bool = False  # the equal values are invalid
     asked: float = -np.inf  # when that was looked at, in this run
     waits: bool = False  # the equal values wait until that is known
     same: list[Measurement] = field(default_factory=list)  # those of a sensor that may wait
     by_hand: bool = False  # no sensor has measured yet: nothing is late
     known: deque[tuple[float, Array]] = field(default_factory=lambda: deque(maxlen=RECENT_VALUES))  # not zero
-    zero: bool = False  # the newest is an exact zero that is none
+    zero: bool = False  # the newest is an invalid exact zero
     zeros: deque[float] = field(default_factory=lambda: deque(maxlen=OFTEN))  # when such began [s]
     told: bool = False  # that they come often
 
@@ -122,7 +119,7 @@ class Watch:
         return np.frombuffer(self.values), self.equal, self.since, self.until
 
     def release(self) -> tuple[Measurement, ...]:
-        """What has waited; it waits no more."""
+        """The waiting measurements, which no longer wait."""
         waiting = tuple(self.same) if self.waits else ()
         self.waits, self.same = False, []
         return waiting
@@ -185,7 +182,7 @@ class Faults:
         return replace(verdict, retract_since=None if waited else since, count=watch.equal - hold.right)
 
     def _note(self, m: Measurement, watch: Watch) -> None:
-        """Remember when it was measured, and what tells of the vehicle's motion."""
+        """Store when it was measured, and the values that show the vehicle's motion."""
         if watch.time > -np.inf:
             step = m.time - watch.time
             watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
@@ -221,7 +218,7 @@ class Faults:
         return late
 
     def _are_held(self, m: Measurement, watch: Watch, hold: Hold) -> bool:
-        """Whether equal values are none, as a log tells it, from what came before."""
+        """Whether equal values are invalid by the rules of a log, from earlier values."""
         if watch.held or watch.equal < hold.repeats or m.time - watch.since < hold.seconds:
             return watch.held
         if m.sensor == "imu":
@@ -244,7 +241,7 @@ class Faults:
         return watch.waits and watch.asked == -np.inf
 
     def state(self) -> dict[str, dict[str, Any]]:
-        """What is remembered of sensors whose values may be held, as plain values and arrays."""
+        """State of sensors whose values may be held, as plain values and arrays."""
         return {
             sensor: {
                 "held": watch.held,
@@ -255,7 +252,7 @@ class Faults:
         }
 
     def restore(self, state: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on from where another stood."""
+        """Continue from the state of another."""
         for sensor, known in state.items():
             runs = [(row[3:], int(row[0]), float(row[1]), float(row[2])) for row in np.asarray(known["runs"])]
             values, equal, since, until = runs.pop()
@@ -265,14 +262,14 @@ class Faults:
             self.watches[sensor] = watch
 
     def accept(self, m: Measurement) -> Screening:
-        """Take a measurement that a person gives, as it is; a sensor that gives the like is not said to have spoken."""
+        """Take a measurement that a person gives, as it is; it does not count for a sensor of the same kind."""
         watch = self.watches.setdefault(m.sensor, Watch(by_hand=True))
         if watch.by_hand:
             watch.time = max(m.time, watch.time)
         return _GOOD
 
     def tick(self, time: float) -> None:
-        """Note sensors that have said nothing for too long."""
+        """Note sensors that have been silent for too long."""
         for sensor, watch in self.watches.items():
             if sensor in OCCASIONAL or watch.by_hand:
                 continue
@@ -284,7 +281,7 @@ class Faults:
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
 
     def _is_false_zero(self, m: Measurement, watch: Watch, company: Company) -> bool:
-        """Whether a measurement is an exact zero that is none; what is not zero is remembered."""
+        """Whether a measurement is an invalid exact zero; other values are stored."""
         values = m.values[: company.columns]
         if values.any():
             watch.zero = False
@@ -326,7 +323,7 @@ class Faults:
 
 WINDOW_S = 300.0  # of motion that is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
-AGAIN_S = 1800.0  # after which what lasts is said again
+AGAIN_S = 1800.0  # after which a lasting finding is reported again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
 CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
 
@@ -352,7 +349,7 @@ class Crosscheck:
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
     def add(self, m: Measurement) -> list[Event]:
-        """Take a measurement; what is known to be late or wrong from now on, with the configuration that mends it."""
+        """Take a measurement; returns new findings of late or wrong sensors, with the correcting configuration."""
         if m.sensor != "imu":
             self._newest.append(m)
             return []
@@ -371,7 +368,7 @@ class Crosscheck:
         return next(self._work, [])
 
     def finish(self) -> list[Event]:
-        """No more measurements: what `add` has not said yet."""
+        """No more measurements: the findings that `add` has not reported yet."""
         events = [*chain.from_iterable(self._work)]
         self._take_newest(-math.inf)
         return events + ([*chain.from_iterable(self._compared())] if self._suspected else [])
@@ -395,7 +392,7 @@ class Crosscheck:
                 self._window.pop(sensor, None)
 
     def _compared(self) -> Iterator[list[Event]]:
-        """Compare the window, one check after the other, and say at last what was found."""
+        """Compare the window, one check after the other, and report the findings at the end."""
         log = Log("the last minutes", self._window, None)
         now = float(log["imu"].time[-1])
         start = min(float(stream.time[0]) for stream in log.streams.values())
@@ -404,7 +401,7 @@ class Crosscheck:
         for check in CHECKS:
             for f in check(log, self.config):
                 contradicted |= check is dvl_and_imu and f.level != "ok"
-                # what `vertical` says of scales is for whole dives: in a short window slow pings of waves have another
+                # scales by `vertical` hold for whole dives: in a short window slow pings of waves have another
                 whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
                 if f.level != "ok" and (f.of_clock or whole):
                     found.setdefault((f.sensor, f.kind if f.of_clock else check.__name__), f)
@@ -425,7 +422,7 @@ class Crosscheck:
         yield events
 
 
-REJECTED_S = 1.0  # a sensor is said to be rejected after as long
+REJECTED_S = 1.0  # after which a sensor is reported as rejected
 
 
 @dataclass
@@ -492,7 +489,7 @@ def _failed(watch: Watch, time: float) -> float:
 SENSOR = "dvl"
 REJECTIONS, WITHIN_S = 3, 20.0  # so many rejections within that time are no knock
 COHERENT_S = 25.0  # without rejections before
-KEPT_OUT_S, LONGEST_S = 20.0, 160.0  # how long it is left out, twice as long whenever it goes on
+KEPT_OUT_S, LONGEST_S = 20.0, 160.0  # how long it is left out, twice as long each time
 
 
 @dataclass
@@ -522,7 +519,7 @@ class Incoherence:
             self._recent.popleft()
 
     def forget(self) -> None:
-        """Another filter goes on, with another state: keyframes that have passed are none of its own."""
+        """Another filter continues: forget keyframes of the previous filter."""
         self._recent.clear()
 
     def state(self) -> list[float]:
@@ -530,7 +527,7 @@ class Incoherence:
         return [self._begin, self._end, *self._rejections]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Go on from where another stood."""
+        """Continue from the state of another."""
         self._begin, self._end = state[:2]
         self._rejections.extend(state[2:])
 
@@ -564,7 +561,7 @@ class Incoherence:
         return time - first <= WITHIN_S and first - before >= COHERENT_S
 
     def _go_back(self, engine: FixedLag, since: float) -> None:
-        """Have the filter go on from before a time, without the DVL."""
+        """Have the filter continue from before a time, without the DVL."""
         engine.retract(SENSOR, since)
         oldest = engine.oldest()
         before = [snapshot for snapshot in self._recent if snapshot.time < since]

@@ -1,6 +1,6 @@
-"""A run of the online mode: sources to a navigator, solutions to receivers, everything to disk.
+"""A run of the online mode: sources to a navigator, solutions to receivers, all data to disk.
 
-All sources as one stream of messages, in the order of arrival.
+`Feed` merges all sources into one stream of messages, in the order of arrival.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from rovgraph.live.warnings import Warnings
 RATE_HZ = 5.0  # of solutions, about that of pings
 PAGE_RATE_HZ = 10.0  # where a person watches
 COLLECT = (5_000, 200, 50)  # thresholds of the collector: next to nothing here is cyclic; few objects, short pauses
-QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
+QUIET_S = 0.5  # without the IMU, after which time advances by the host's clock
 
 
 @dataclass
@@ -91,7 +91,7 @@ class Session:
         }
 
     def resume(self) -> None:
-        """Go on from the last checkpoint and what was recorded after it."""
+        """Continue from the last checkpoint and what was recorded after it."""
         assert self.files is not None
         state = self.files.state
         if state is not None and self.files.replayed:
@@ -106,18 +106,18 @@ class Session:
         self.navigator.say("start", "resumed", f"continues from the data received up to {self._resumed:.1f} s")
 
     def run(self, feed: Iterable[Message | Command | None]) -> None:
-        """Work off what the sources say."""
+        """Process the messages of the sources."""
         for _ in self.solve(feed):
             pass
 
     def solve(self, feed: Iterable[Message | Command | None]) -> Iterator[Solution]:
-        """Work off what the sources say and yield each solution once it has been sent; the disk has all at the end."""
+        """Process the messages and yield each solution once it has been sent; the disk has all at the end."""
         try:
             with _seldom_collected():
                 for message in feed:
                     if (solution := self._step(message)) is not None:
                         yield solution
-        except GeneratorExit:  # whoever iterates has had enough
+        except GeneratorExit:  # the caller stops iterating
             self._end()
             raise
         if (solution := self._end()) is not None:
@@ -153,7 +153,7 @@ class Session:
         return solution
 
     def _known(self, message: Message) -> bool:
-        """Whether a recording that is read again says what had been received before a crash."""
+        """Whether a recording that is read again holds what had been received before a crash."""
         return self.navigator.clocks.trust and message.stamp is not None and message.stamp <= self._resumed
 
     def _take(self, message: Message) -> None:
@@ -168,7 +168,7 @@ class Session:
                 self.files.recorder.write(time, message.arrival, readings)
 
     def _obey(self, command: Command) -> None:
-        """Do what a person wants; before the first solution nothing is known that it could refer to."""
+        """Execute a person's command; before the first solution it has nothing to refer to."""
         navigator, at = self.navigator, self.solution
         if at is None:
             return
@@ -190,7 +190,7 @@ class Session:
             navigator.say("pilot", "position", text)
 
     def _wait(self) -> None:
-        """Time goes on where nothing comes."""
+        """Advance the time when no message comes."""
         now = self.navigator.clocks.now(host.time())
         if now is not None and now - self.navigator.time > QUIET_S:
             self.navigator.tick(now)
@@ -211,7 +211,7 @@ class Session:
 
 
 def _sds_apart(given: SetPosition, at: Solution) -> float:
-    """How far a place is from a solution, in units of what both are uncertain by."""
+    """Distance of a place from a solution, in units of their joint sd."""
     apart = np.array([given.north, given.east]) - at.position[:2]
     covariance = np.diag(at.position_sd[:2] ** 2 + given.sd**2)
     covariance[0, 1] = covariance[1, 0] = at.cov_north_east
@@ -266,7 +266,7 @@ class Feed:
 
     @property
     def replayed(self) -> bool:
-        """Whether all arrivals are recorded ones, so that nothing has to do with the host's clock."""
+        """Whether all arrivals are recorded ones, so that the host's clock is not used."""
         return all(source.pace not in (None, 1.0) for source in self._sources)
 
     def offer(self, command: Command) -> bool:
@@ -331,7 +331,7 @@ class Feed:
                     yield message
 
     def _run(self, source: Source) -> None:
-        """In a source's thread: what it says into the queue, and at last that it has ended."""
+        """In a source's thread: its messages into the queue, and at the end that it has ended."""
         put = self._put_or_drop if source.lossy else self._put
         try:
             for message in source.messages(self._stop):

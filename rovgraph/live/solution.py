@@ -1,4 +1,4 @@
-"""What the online mode says of a moment: where the vehicle is, how sure that is, and how the sensors are."""
+"""A navigation solution: position, velocity and attitude with their uncertainty, and the state of the sensors."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from rovgraph.geometry import Array
 
 @dataclass(frozen=True)
 class Event:
-    """Something that a person should know.
+    """An event that a person should know.
 
     Attributes
     ----------

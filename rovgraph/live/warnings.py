@@ -1,4 +1,4 @@
-"""What sources, outputs and disks complain of: each is counted, and few are said aloud."""
+"""Counts warnings of sources, outputs and disks; reports the first ones."""
 
 import threading
 import time
@@ -15,7 +15,7 @@ class Warnings:
 
     Parameters
     ----------
-    say : called with source, kind and text of what is let through, in the thread that complains;
+    say : called with source, kind and text of each reported warning, in the thread that warns;
         None = only count
     period : [s]
     clock : seconds, increasing
@@ -38,14 +38,14 @@ class Warnings:
             return dict(self._counts)
 
     def complain(self, source: str, kind: str, text: str, once: bool = False) -> None:
-        """Count, and say it unless the like was said within the period.
+        """Count, and report it unless the same kind was reported within the period.
 
         Parameters
         ----------
         source : URL that it is about
         kind : short and fixed
         text : one line for a person
-        once : say it the first time only
+        once : report it the first time only
         """
         key = source, kind
         with self._lock:

@@ -1,8 +1,9 @@
 """A log: one sparse, wide CSV or Parquet file, read into one stream per sensor.
 
-`log` holds what a log is, `streams` its measurements by sensor, `units` the units that a file may use; `table`
-turns a file into columns of numbers, `reading` makes streams of them. `beams` has what each beam of a DVL measured.
-docs/log-format.md is the contract.
+May import `rovgraph.sensors`, `model`, `kernels` and what is below. Begin with `log` (`Log`, which all else takes) and
+`streams` (the measurements of one sensor); `reading` makes them from a file that `tables` turns into columns. `units`
+has the units that a file may use, `frozen` and `stamps` find invalid values and stamps, `beams` holds a DVL's single
+beams. docs/log-format.md is the contract.
 """
 
 from rovgraph.log.log import Log, gathered, read_log

@@ -1,4 +1,4 @@
-"""What each beam of a DVL measured: a table beside a log. Reports show it; no estimate uses it.
+"""Single beams of a DVL: a table beside a log, which reports show and no estimate uses.
 
 The table has ``time`` [s] and, for every beam by the instrument's own number k, ``valid_k`` (1 or 0), ``velocity_k``
 [m/s], ``range_k`` or ``distance_k`` [m]. One of these is enough; other columns are ignored.
@@ -49,7 +49,7 @@ def beams_of(table: Table) -> Stream:
     valid, far = _valid(cells, columns, table), np.full((len(time), len(numbers)), np.nan)
     for what in ("distance", "range"):
         far = cells.get(what, far)
-    far = np.where(valid & np.isfinite(far) & (far > 0.0), far, np.nan)  # 0 and -1 are none
+    far = np.where(valid & np.isfinite(far) & (far > 0.0), far, np.nan)  # 0 and -1 are invalid
     names = (*(f"valid_{k}" for k in numbers), *(f"range_{k}" for k in numbers))
     return Stream(BEAMS, names, time[order], np.hstack([valid, far])[order], table.line[order])
 
@@ -83,7 +83,7 @@ def usable_beams(table: Path | Mapping[str, ArrayLike], source: str = "") -> Str
 
 
 def beams_beside(log: Path) -> Stream | None:
-    """The beams that a file beside a log holds, ``log.dvl_beams.csv``; None where there is none that can be used.
+    """The beams that a file beside a log holds, ``log.dvl_beams.csv``; None without a usable one.
 
     Warns
     -----

@@ -27,7 +27,7 @@ def write_csv(
     Parameters
     ----------
     table : columns of numbers or text; NaN is an empty cell
-    path : of the file; one that is to be compressed is left to pandas
+    path : of the file; pandas writes compressed ones
     digits : significant digits of a float
     append : to an older file, without the names
     decimals : column -> digits after the point, of columns of floats that are all known
@@ -130,7 +130,7 @@ def _text(
 
 
 def _format(column: NDArray[Any], holey: bool, digits: int) -> str | None:
-    """How a cell is formatted; None where pandas knows better."""
+    """How a cell is formatted; None where pandas formats it."""
     if column.dtype.kind == "f":
         return "%s" if holey else f"%.{digits}g"
     if column.dtype.kind in "iu":

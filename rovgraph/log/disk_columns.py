@@ -1,8 +1,8 @@
-"""Columns that are too long for memory: kept in temporary files, and computed with in pieces.
+"""Columns that are too long for memory: kept in temporary files, and processed in pieces.
 
-A file has no name where the system can do without, so it is gone when nothing refers to its column any more, however
-the process ends. It is mapped into memory for reading; what was read is released after each piece, and the system
-reads it again where it is needed again.
+Where the system permits, a file has no name, so it disappears with the last reference to its column, however the
+process ends. It is mapped into memory for reading; each piece is released after use, and the system reads it again when
+it is needed again.
 """
 
 import errno

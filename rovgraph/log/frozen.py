@@ -1,13 +1,13 @@
-"""Measurements that are none: a sensor repeats or halves them, or writes zeros, although the vehicle moves.
+"""Invalid measurements: a sensor repeats or halves its values, or writes zeros, although the vehicle moves.
 
 Some instruments write zeros when they lose the bottom, others their last value when they hang, others the mean of a
-ping and nothing. A sensor that measures shows its noise, so a value that returns exactly for seconds is none, unless
-the sensor usually holds its values for so long. Where resolution may hide the noise (depth, heading), another sensor
-has to show the motion.
+ping and zero. Real measurements are noisy, so a value that repeats exactly for seconds is invalid, unless the sensor
+usually holds its values for so long. Where resolution may hide the noise (depth, heading), another sensor has to show
+the motion.
 
-Single ones are known by the company they keep (`false_values`): an exact zero is none where the measurements next to it
-are further from zero than the vehicle can come and go meanwhile, so zeros of a vehicle at rest stay. That needs neither
-another sensor nor its clock.
+Single values are judged by their neighbours (`false_values`): an exact zero is invalid where the measurements next to
+it are further from zero than the vehicle can come and go meanwhile, so zeros of a vehicle at rest stay. That needs
+neither another sensor nor its clock.
 """
 
 import sys
@@ -28,8 +28,8 @@ NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ROUNDING = 1e-9  # relative, of numbers that are converted
 NOISE_STEPS = 4.0  # of a sensor's resolution, that its second differences exceed if its noise hides it
 ALIVE = 1e-6  # spread of an IMU's signals that are more than rounding [m/s^2, rad/s]
-CLEAR_SPEED = 0.1  # that is no standstill [m/s]
-AROUND_SECONDS, AROUND_PERIODS = 5.0, 6.0  # to measurements that tell of a zero between them, the longer of the two
+CLEAR_SPEED = 0.1  # above a standstill's [m/s]
+AROUND_SECONDS, AROUND_PERIODS = 5.0, 6.0  # to the neighbours by which a zero is judged, the longer of the two
 STOPPING, BRAKING = (
     0.3,
     1.0,
@@ -41,17 +41,17 @@ FULL = 0.8  # part of the speed around that is the full one,
 FULL_OF, FULL_RANK = 9, 3  # which is the third largest of nine
 ALIKE = 0.5  # part of the speed by which the pings around may differ
 OUTLIES, QUIET = 8.0, 0.25  # times the distance from the mean of both neighbours that a quarter of the pings keeps
-FEWEST = 3  # that tell of a habit
+FEWEST = 3  # that show that it is usual
 ENOUGH_VALUES = 20  # that show whether there is noise
 CHANCE = 10.0  # times as many repetitions of the last value as of the one before it are no chance
 SURE = 5.0  # standard deviations, from which on an error is no chance
-TURN_RATE = 0.05  # sd of the rate about any axis that is no standstill [rad/s]
-FIX_DISTANCE = 10.0  # between fixes that is no standstill [m]
+TURN_RATE = 0.05  # sd of the rate about any axis, above a standstill's [rad/s]
+FIX_DISTANCE = 10.0  # between fixes, above a standstill's [m]
 DRIVE_CHANGE = 0.5  # of a thruster, as part of its sd over the log
 TURNED = np.deg2rad(17.0)  # by the gyro, while a heading stands still,
-TURN_DRIFT = 0.03  # and more than its bias may feign [rad/s]
+TURN_DRIFT = 0.03  # and more than its bias may cause [rad/s]
 DIVED = 0.5  # by the DVL, while a depth stands still [m],
-SLOPE = 0.1  # and more than this part of the way, which a tilted mounting feigns
+SLOPE = 0.1  # and more than this part of the way, which a tilted mounting may cause
 DIVE_SECONDS = 20.0  # over which it is looked for
 LEVEL_SECONDS = 2.0  # over which the specific force shows the vertical
 LONGEST_STEP = 1.0  # between pings over which a velocity is integrated [s]
@@ -143,14 +143,14 @@ class Runs:
 
 @dataclass(frozen=True)
 class FrozenStretch:
-    """Measurements of a sensor that are none.
+    """Invalid measurements of a sensor.
 
     Attributes
     ----------
     sensor : name of the stream
     kind : "zero", "half" (the speed of the pings around), "repeated" (the value before), "held" for seconds
     time : ndarray, shape (n,), when they were measured, increasing [s]
-    why : what shows that they are none, as "it moves at 0.40 m/s just before"
+    why : what shows that they are invalid, as "it moves at 0.40 m/s just before"
     single : they lie between others that are right; else they are all of a time
     """
 
@@ -178,7 +178,7 @@ class FrozenStretch:
 
 @dataclass(frozen=True)
 class Company:
-    """What an exact zero is judged by.
+    """Neighbours by which an exact zero is judged.
 
     Attributes
     ----------
@@ -209,12 +209,12 @@ class Company:
         return np.asarray(np.linalg.norm(wrap_angle(values) if self.angle else values, axis=-1))
 
     def left(self, near: Array, further: Array, noise: float = 0.0) -> Array:
-        """Distance from zero that is left once a change goes on.
+        """Distance from zero that remains if a change continues.
 
         Parameters
         ----------
         near, further : ndarray, shape (..., columns), next to the zero, and the one beyond
-        noise : change that is none
+        noise : change within the noise
         """
         return self.size(near) - np.maximum(self.size(self.between(further, near)) - noise, 0.0)
 
@@ -228,7 +228,7 @@ class Company:
 
 
 def companies(config: Config) -> Mapping[str, Company]:
-    """Sensors whose exact zeros may be none, each with what tells."""
+    """Sensors whose exact zeros may be invalid, each with the sensors that show it."""
     speed = Company(3, CLEAR_SPEED, STOPPING, BRAKING, "it moves at {:.2f} m/s", rests=True)
     heading = Company(1, np.deg2rad(10.0), TURNING, TURNING, "it is at {:.0f} deg", np.rad2deg(1.0), angle=True)
     fastest = config.dvl.max_speed_mps
@@ -245,7 +245,7 @@ def companies(config: Config) -> Mapping[str, Company]:
 
 
 def frozen_stretches(log: Log, config: Config) -> list[FrozenStretch]:
-    """All measurements of a log that are none, in the order of time."""
+    """All invalid measurements of a log, in the order of time."""
     found = false_values(log, config)
     if "dvl" in log:
         found += _zeros_meanwhile(log, found)
@@ -262,7 +262,7 @@ def frozen_stretches(log: Log, config: Config) -> list[FrozenStretch]:
 
 
 def false_values(log: Log, config: Config) -> list[FrozenStretch]:
-    """Measurements that are none by those of the same sensor next to them: zeros, half speeds, repetitions."""
+    """Invalid measurements by those of the same sensor next to them: zeros, half speeds, repetitions."""
     found: list[FrozenStretch] = []
     for sensor, company in companies(config).items():
         if sensor not in log:
@@ -278,18 +278,18 @@ def false_values(log: Log, config: Config) -> list[FrozenStretch]:
 
 
 def without(stream: Stream, found: Iterable[FrozenStretch]) -> Stream:
-    """A stream without measurements that are none."""
+    """A stream without its invalid measurements."""
     return stream.take(~are_in(stream, found))
 
 
 def are_in(stream: Stream, found: Iterable[FrozenStretch]) -> NDArray[np.bool_]:
-    """Which measurements of a stream are none, shape (n,)."""
+    """Which measurements of a stream are invalid, shape (n,)."""
     times = [stretch.time for stretch in found if stretch.sensor == stream.sensor]
     return np.isin(stream.time, np.concatenate(times)) if times else np.zeros(len(stream), bool)
 
 
 def log_without(log: Log, found: Sequence[FrozenStretch]) -> Log:
-    """A log without measurements that are none; itself where there are no such."""
+    """A log without its invalid measurements; itself if it has none."""
     if not found:
         return log
     streams = {name: without(stream, found) for name, stream in log.streams.items()}
@@ -297,7 +297,7 @@ def log_without(log: Log, found: Sequence[FrozenStretch]) -> Log:
 
 
 def without_frozen(log: Log, config: Config) -> tuple[Log, list[FrozenStretch]]:
-    """The log without measurements that are none, and these."""
+    """The log without its invalid measurements, and these."""
     found = frozen_stretches(log, config)
     return log_without(log, found), found
 
@@ -450,7 +450,7 @@ def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
 
 
 def is_false_zero(company: Company, at: float, time: Array, values: Array) -> bool:
-    """Whether an exact zero is none by what was measured before it, all that is known while a dive goes on.
+    """Whether an exact zero is invalid by the measurements before it, the only ones while a dive goes on.
 
     Parameters
     ----------
@@ -500,7 +500,7 @@ def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | Non
 def _motion_shown(
     sensor: str, runs: Runs, long: NDArray[np.bool_], log: Log, config: Config, turning: float | None
 ) -> Shown | None:
-    """What tells whether the vehicle moved during a run so that the values of a sensor would have changed.
+    """Whether the vehicle moved during a run so that the values of a sensor would have changed.
 
     Where its noise shows it has failed if anything moves; where resolution may hide it, only if what it measures does.
     """
@@ -557,7 +557,7 @@ def _turn_by_gyro(log: Log, config: Config, turning: float | None) -> Shown:
 
 
 def _dive_by_dvl(pings: Stream, imu: Stream, config: Config, runs: Runs) -> Shown:
-    """That the DVL, levelled, shows a descent or climb beyond what depths tell apart."""
+    """That the DVL, levelled, shows a descent or climb beyond the resolution of the depths."""
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     descent = np.sum(v_b * downwards(imu, config, pings.time), axis=1)
     down, way = (integral(pings.time, v, LONGEST_STEP) for v in (descent, np.linalg.norm(v_b, axis=1)))
@@ -588,7 +588,7 @@ def shows_noise(values: Array, counts: NDArray[np.int64]) -> bool:
 
 
 def _most_dived(time: Array, down: Array, way: Array) -> float:
-    """The largest descent or climb within a time that is more than a tilted mounting would feign [m]."""
+    """The largest descent or climb within a time that is more than a tilted mounting would cause [m]."""
     parts = np.split(np.arange(len(time)), np.flatnonzero(np.diff((time - time[0]) // DIVE_SECONDS)) + 1)
     dived = [float(np.ptp(down[part])) for part in parts]
     return max(d if d > SLOPE * float(np.ptp(way[part])) else 0.0 for d, part in zip(dived, parts, strict=True))
@@ -612,7 +612,7 @@ def _alive(log: Log, run: EqualRun) -> str:
 
 
 def _meanwhile(log: Log, first: float, last: float) -> str:
-    """What other sensors say of the motion between two times; "" if they see none."""
+    """Motion between two times by other sensors, in words; "" without motion."""
     rates = _between(log, "imu", first, last)[:, 3:]
     if len(rates) > 10 and rates.std(axis=0).max() > TURN_RATE:
         return "the gyro turns"

@@ -1,8 +1,8 @@
-"""Latitudes and longitudes that are none, or are written otherwise than in degrees, told apart by their numbers.
+"""Latitudes and longitudes that are invalid, or not in degrees, recognised by their numbers.
 
-A receiver without a fix writes a number that no position has. Degrees and minutes in one number (4330.5 = 43 deg 30.5
-min), 1e-7 degrees, and exchanged columns are beyond the range of degrees in every row, and within it once put right.
-What stays within the range (radians, exchanged columns near the equator) shows against the DVL
+A receiver without a fix writes an impossible position. Degrees and minutes in one number (4330.5 = 43 deg 30.5
+min), 1e-7 degrees, and exchanged columns are beyond the range of degrees in every row, and within it once corrected.
+Errors within the range (radians, exchanged columns near the equator) show against the DVL
 (`diagnosis.check.fixes`).
 """
 
@@ -25,7 +25,7 @@ _TOLD = 6  # digits
 
 
 def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str) -> tuple[Array, Array]:
-    """Positions without those that are none, NaN instead, shape (n,) each [deg].
+    """Positions with NaN in place of invalid ones, shape (n,) each [deg].
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str
 
     Raises
     ------
-    InputError : numbers that are no degrees, with the unit that they may be in
+    InputError : numbers that are not degrees, with the unit that they may be in
 
     Warns
     -----
@@ -68,7 +68,7 @@ def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str
 
 
 def what_unit(lat: Array, lon: Array) -> str:
-    """What to do about positions that are no degrees, shape (n,) each, finite."""
+    """Remedy for positions that are not degrees, shape (n,) each, finite."""
     unit = unit_of(lat, lon)
     if unit == "exchanged":
         return "they are exchanged: state columns: {fix_lat: fix_lon, fix_lon: fix_lat}, with the log's own names"
@@ -82,7 +82,7 @@ def what_unit(lat: Array, lon: Array) -> str:
 
 
 def unit_of(lat: Array, lon: Array) -> str:
-    """Unit of positions that are no degrees, shape (n,) each, finite; "exchanged", or "" where it does not show."""
+    """Unit of positions that are not degrees, shape (n,) each, finite; "exchanged", or "" where it is unclear."""
     size_lat, size_lon = np.abs(lat), np.abs(lon)
     if size_lat.max() <= 360.0 and size_lon.max() <= 90.0:
         return "exchanged"

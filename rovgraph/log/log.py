@@ -1,4 +1,4 @@
-"""What a dive has recorded, from a file, a data frame or arrays."""
+"""`Log`: the recording of a dive, from a file, a data frame or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,6 +1,6 @@
 """From a file to streams: names, units, the order of time, one stream per sensor.
 
-What can be repaired is repaired and said in a `DataWarning`; what cannot is an `InputError`.
+A repaired fault is reported in a `DataWarning`; a fault that cannot be repaired is an `InputError`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -346,7 +346,7 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
 
 
 def _known_sd(column: Column, sd: Array, line: Lines, source: str) -> None:
-    """An sd of 0, -1, 9999 and the like, as many instruments write it that do not know, becomes NaN.
+    """An sd of 0, -1, 9999 and the like, which many instruments write without an estimate, becomes NaN.
 
     Placeholders among better sds stay: such a measurement is worth little.
     """

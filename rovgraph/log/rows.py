@@ -1,4 +1,4 @@
-"""Rows that fill few of a log's columns each: a large log without its empty cells."""
+"""Sparse rows: a large log without its empty cells."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence

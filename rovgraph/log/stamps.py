@@ -1,8 +1,8 @@
-"""Stamps of clocks that misbehave: what every reader and every live source does about them.
+"""Corrects the stamps of faulty clocks, for every reader and every live source.
 
-Stamps are taken in the order in which they were recorded. Those of a clock that was not set are left out; a counter
-that wraps goes on; a clock that is set by hours, leap seconds, days or 1024 weeks is put right; what stands still, or
-was written with too few digits, is called that.
+Stamps are taken in the order in which they were recorded. Stamps of a clock that was not set are left out; a counter
+that wraps is continued; a clock that is set by hours, leap seconds, days or 1024 weeks is corrected; stamps that stand
+still, or were written with too few digits, are reported.
 """
 
 from collections.abc import Iterator
@@ -36,8 +36,8 @@ FULL = (4294967295.0, 4294967.295, 4294.967295)  # 0xFFFFFFFF in s, ms, us: no t
 GAP_S, GAP, LEAST_GAP_S = 60.0, 0.002, 0.5  # where a counter wraps: at most [s], of its range, at least [s]
 NEAR_S = 2.0  # between stamps around a setting [s]
 SURELY = 0.5  # share of the shorter of two spans that a known difference of clocks makes common
-MOVES = 5  # rows that tell of a setting, on each side of it
-ENOUGH = 20  # rows that show whether stamps go on
+MOVES = 5  # rows that show a setting, on each side of it
+ENOUGH = 20  # rows that show whether stamps advance
 STILL = 0.95  # of them, that have the stamp of the one before
 LOOK = 1000  # rows at the beginning, in the middle and at the end that are looked at first
 DIGITS, LARGE = 7, 1e5  # significant digits that are too few for stamps as large as that [s]
@@ -59,9 +59,9 @@ def unwrapped(count: Array, wrap: float) -> Array:
 
 
 def counter_range(before: float, after: float) -> float:
-    """What a counter has wrapped by between two stamps, as `COUNTERS` has it; 0 where it did not [s].
+    """Range of a counter that wrapped between two stamps, of `COUNTERS`; 0 where it did not [s].
 
-    One step back tells nothing of a short counter: a message that comes late makes it, too.
+    One step back does not prove a short counter: a late message causes it, too.
     """
     for wrap in (own for own in COUNTERS if own > GAP_S):
         if wrap - _near(wrap) < before <= wrap and 0.0 <= after < _near(wrap):
@@ -76,7 +76,7 @@ def mend(
     step_back: float = STEP_BACK,
     not_set: float = NOT_SET,
 ) -> tuple[Array, list[str]]:
-    """Stamps of one clock in the order in which they were recorded, put right as far as they tell how.
+    """Stamps of one clock in the order in which they were recorded, corrected as far as possible.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def mend(
     Returns
     -------
     time : ndarray, shape (n,) [s]; NaN where a stamp cannot be used; rows may still be late by ``step_back``
-    said : what was done, a sentence each
+    said : corrections, a sentence each
 
     Raises
     ------
@@ -140,7 +140,7 @@ def mend(
 
 
 def require_moving(time: Array, where: str) -> None:
-    """Check that stamps, shape (n,) [s], go on.
+    """Check that stamps, shape (n,) [s], advance.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def few_digits(values: Array) -> bool:
 def known_offset(
     own: tuple[float, float], other: tuple[float, float], cycle: float = 0.0
 ) -> tuple[float, str, bool] | None:
-    """What makes a clock's stamps meet those of another that shows Unix time, of all that clocks are usually off by.
+    """Offset, of the usual ones, that brings a clock's stamps to another's in Unix time.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def _still(time: Array) -> bool:
 
 
 def _breaks(time: Array, step_back: float) -> NDArray[np.int64]:
-    """Rows whose stamp does not go on from that of the row before."""
+    """Rows whose stamp does not follow that of the row before."""
     shortest = next((wrap for wrap in COUNTERS if len(time) and time.min() >= 0.0 and time.max() <= wrap), np.inf)
     back = min(step_back, 0.5 * shortest)
     return steps(time, lambda step: (step < -back) | (step > JUMP))

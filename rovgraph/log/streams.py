@@ -1,4 +1,4 @@
-"""What a log is: one stream of measurements per sensor, in the order of time."""
+"""Streams: the measurements of one sensor of a log, in the order of time."""
 
 import math
 import re

@@ -1,8 +1,8 @@
 """A file as columns of cells: CSV as anyone writes it, gzipped or not, or Parquet, told apart by content.
 
 Encoding, separator, decimal commas and a row of units are found in the first bytes, and pandas parses. A file that is
-not written as this program's own is read with a warning that says how. What is wrong with a file is said in one line:
-which file, which line and column, what was expected and what to do.
+not written as this program's own is read with a warning that states how. An error is one line: which file, which line
+and column, what was expected and what to do.
 """
 
 import csv
@@ -68,7 +68,7 @@ class Table:
 
         Raises
         ------
-        InputError : a cell that is no number
+        InputError : a cell that is not a number
         """
         cells = self.frame[name]
         if held := _no_numbers(cells):
@@ -123,11 +123,11 @@ class Table:
         Returns
         -------
         time : ndarray, shape (n,), NaN = empty cell
-        how : dates, and numbers that are no seconds, were read, a phrase
+        how : dates, and numbers that are not seconds, were read, a phrase
 
         Raises
         ------
-        InputError : a cell that is no time; a date that may mean two days
+        InputError : a cell that is not a time; a date that may mean two days
         """
         cells = self.frame[name]
 
@@ -351,7 +351,7 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
 
     Raises
     ------
-    InputError : columns that are no arrays of one dimension and the same length; or as `table_of_frame`
+    InputError : columns that are not arrays of one dimension and the same length; or as `table_of_frame`
     """
     frames = []
     for number, table in enumerate(tables, 1):
@@ -589,7 +589,7 @@ def _with_decimals_of_seconds(text: bytes, odd: _Odd) -> bytes | None:
 def _place_of_more(text: bytes, names: Sequence[str], odd: _Odd, layout: CellLayout, source: str) -> tuple[int, int]:
     """Where columns without a name stand in rows that are longer than the header, and how many they are.
 
-    Some programs go on with more columns than they began with. Their place is where the row before goes on.
+    Some programs add columns in the middle of a file. Their place is where the row before continues.
 
     Raises
     ------
@@ -630,7 +630,7 @@ def _cause(odd: _Odd, width: int, layout: CellLayout) -> str:
 
 
 def _alike(one: str, other: str) -> float:
-    """How much a cell goes on with the one before: 1 = equal, 0 = it is of another kind."""
+    """How well a cell continues the one before: 1 = equal, 0 = it is of another kind."""
     if one == other:
         return 1.0
     if _is_number(one, ".") and _is_number(other, "."):

@@ -1,10 +1,8 @@
-"""Units that a file may use, and names that may be misspelled.
+"""Units of a file's columns, converted to SI on reading and to degrees for a person; hints for misspelled names.
 
-A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
-(``gyr: deg/s``); everything becomes SI and radians. A minus before the unit turns the sign (``depth: -m``). How an
-attitude counts is declared in the same way (``ahrs: enu``).
-
-Units as a person reads them: degrees instead of radians.
+A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns (``gyr: deg/s``); everything becomes SI and
+radians. A minus before the unit turns the sign (``depth: -m``). The axes of an attitude are declared in the same way
+(``ahrs: enu``).
 """
 
 import difflib
@@ -113,7 +111,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Scale:
-    """What makes SI and radians of the numbers of a column: a factor, or a form of `FORMS`."""
+    """Conversion of a column's numbers to SI and radians: a factor, or a form of `FORMS`."""
 
     factor: float = 1.0
     form: str = ""
@@ -132,7 +130,7 @@ class Scale:
 
 
 def scales(units: Mapping[str, str], source: str) -> dict[str, Scale]:
-    """What makes SI and radians of each column that a unit was declared for.
+    """Conversions to SI and radians of each column that a unit was declared for.
 
     Parameters
     ----------

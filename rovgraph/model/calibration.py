@@ -5,16 +5,17 @@ simulator's hidden truth and the rows of a report all come from `TABLE`.
 A variable is added by adding a row here and using its name in a measurement model.
 
 Compiled measurement equations take all of the calibration as one vector, the variables of `TABLE` one after
-the other: `LAYOUT` says where each stands.
+the other: `LAYOUT` has the index of each.
 
-What every instrument has and nobody knows exactly (mounting, place and scale of the DVL, the gyro's scale, the depth
-sensor's offset) is considered by default: held at its mean, with its uncertainty in that of all else.
+Constants that every instrument has and that are seldom known exactly (mounting, lever arm and scale of the DVL, the
+gyro's scale, the depth sensor's offset) are considered by default: held at their mean, with their uncertainty in that
+of all else.
 
 The offset and the deviation of every compass are estimated by default, of a magnetometer its
 hard iron instead of the deviation: no compass in a vehicle is free of them, and holding them
 at zero pushes them into the DVL's misalignment and makes the track look far more certain than
-it is. They have a second, wider sd, of a compass that nobody calibrated and nothing checks; which of the two holds
-depends on the log (`rovgraph.inference.assumptions`), unless the configuration states one.
+it is. They have a second, wider sd, for a compass without a stated calibration that no other sensor checks; which of
+the two holds depends on the log (`rovgraph.inference.assumptions`), unless the configuration states one.
 """
 
 from dataclasses import dataclass
@@ -44,8 +45,8 @@ class Variable:
         says otherwise
     time_constant : default time constant of an error that lasts, first-order Gauss-Markov with the prior's sd [s];
         infinite = no such error
-    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, which nobody
-        calibrated and nothing checks [unit]; None = there is no such case
+    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, without a stated
+        calibration or a second sensor [unit]; None = not for this variable
     """
 
     name: str
@@ -473,7 +474,7 @@ def unregister(name: str) -> None:
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of a calibration variable before the data speak.
+    """Prior of a calibration variable.
 
     Attributes
     ----------

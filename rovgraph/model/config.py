@@ -1,25 +1,17 @@
-"""`Config`, and how it is read, written and described.
+"""The configuration: `Config`, and how it is read, completed, checked, written and described.
 
-Noise and bias of an inertial unit that cannot be of one instrument.
+A configuration is YAML; every key is optional, an unknown key is an error. `Config` holds what an estimator assumes
+about the vehicle, its sensors and the sea. `load_config` reads a file, `Config.to_yaml` writes the effective one,
+`describe` lists all keys, `beliefs` gives the calibration variables of `rovgraph.model.calibration` their priors.
+Native files complete a configuration only where it states no value itself.
 
-A sensor of density d, averaged at rest for a time T, shows its bias to d / sqrt(T). A prior that is sharper than ten
-minutes of that is knowledge that hardly anyone has. A prior that is far wider is of a worse instrument: of the
-instruments whose data sheets state both (`rovgraph.model.presets`) the widest offset is 250 sqrt(Hz) d.
+Sections that depend on registered sensors and variables get their keys when their class is made; `add_key` and
+`remove_key` change them afterwards, and the sections that contain them.
 
-Calibration variables in the configuration, and the priors that come of them.
-
-Sections of the configuration that grow with what is registered.
-
-A section gets its keys when its class is made; `add_key` and `remove_key` change them afterwards, and those of all
-that has the section inside.
-
-A configuration completed by what files know: only where it states nothing itself.
-
-The configuration: YAML, every key optional, an unknown key is an error.
-
-`Config` holds what an estimator believes about the vehicle, its sensors and the sea.
-`load_config` reads a file, `Config.to_yaml` writes the effective one, `describe` lists
-all keys, `beliefs` gives the calibration variables of `rovgraph.model.calibration` their priors.
+Noise and bias of an inertial unit are checked against each other. A sensor of density d, averaged at rest for a time T,
+shows its bias to d / sqrt(T). A prior sharper than ten minutes of that is hardly ever justified. A prior that is far
+wider belongs to a worse instrument: of the instruments whose data sheets state both (`rovgraph.model.presets`) the
+widest offset is 250 sqrt(Hz) d.
 """
 
 import io
@@ -430,7 +422,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     Parameters
     ----------
     config : as stated
-    unchecked : calibration variables of a compass that nobody calibrated and nothing checks
+    unchecked : calibration variables of a compass without stated calibration that no sensor checks
     names : calibration variables that are stated; None = all
     """
     given, entries = config.calibration, {}
@@ -519,7 +511,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
         data = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError) as error:  # ValueError: a date or a number that is none
+    except (YAMLError, ValueError) as error:  # ValueError: an invalid date or number
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = str(getattr(error, "problem", None) or error or "cannot be parsed").splitlines()[0]
@@ -532,7 +524,7 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
-    """What keys and values say, by a model that knows all of its keys; ``source`` names them in messages.
+    """Keys and values as an instance of a model; ``source`` names them in messages.
 
     Raises
     ------
@@ -541,7 +533,7 @@ def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
     try:
         return model.model_validate(_without_empty(model, data))
     except ValidationError as error:
-        said = dict.fromkeys(complaint(e, model) for e in error.errors())  # each item that a list lacks says the same
+        said = dict.fromkeys(complaint(e, model) for e in error.errors())  # once for all items of a list
         raise InputError(f"{source}: " + "; ".join(said)) from None
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in words that need no knowledge of the program."""
+"""Errors of a configuration in plain words."""
 
 import datetime as dt
 import difflib

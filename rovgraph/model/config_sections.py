@@ -1,4 +1,4 @@
-"""The sections of the configuration, and what may stand in them."""
+"""The sections of the configuration, with the keys and limits of each."""
 
 import datetime as dt
 from functools import partial

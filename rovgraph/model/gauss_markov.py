@@ -22,7 +22,7 @@ def stationary_sd(walk: float, time_constant: float) -> float:
 
 
 def walked(walk: ArrayLike, time_constant: ArrayLike, seconds: ArrayLike) -> tuple[Array, Array]:
-    """What of a process is left after a time, and what has come to it; of infinite time constant it is a random walk.
+    """Factor of a process after a time, and the sd added meanwhile; with infinite time constant a random walk.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class Hydrodynamics:
         return np.hstack([self.thruster_directions, moments]).T
 
     def force_and_moment(self, signals: Array) -> tuple[Array, Array]:
-        """What all thrusters together do, body axes (2.21), (2.22).
+        """Force and moment of all thrusters, body axes (2.21), (2.22).
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class Hydrodynamics:
     ) -> tuple[Array, Jacobians]:
         """Derivative of the components of velocity in body axes (2.18), drag included.
 
-        The acceleration felt in n is R_nb (result + w x velocity), and that of the water.
+        The acceleration in n is R_nb (result + w x velocity), and that of the water.
 
         Parameters
         ----------

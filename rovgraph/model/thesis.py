@@ -2,8 +2,8 @@
 
 K. Jönsson, *Position Estimation of Remotely Operated Underwater Vehicle*,
 LiTH-ISY-EX--10/4361--SE, Linköping University 2010. Its body axes are forward, port, up;
-`FLIP` turns them into forward, starboard, down. What is needed and not printed there
-(inertia, thruster layout) is in `rovgraph.model.config.Vehicle`, and said to be a choice.
+`FLIP` turns them into forward, starboard, down. Numbers that are needed and not printed there
+(inertia, thruster layout) are in `rovgraph.model.config.Vehicle`, marked as choices.
 """
 
 import numpy as np

@@ -1,18 +1,14 @@
-"""Which measurements may reach an estimate.
+"""From readings to admitted measurements: which may enter an estimate, at what time, and as which arrays.
 
-Thruster signals and IMU samples become measurements of `ModelAiding`.
+`admitted` applies the limits of each sensor. `thruster_pieces` makes measurements of `ModelAiding` from thruster
+signals and IMU samples; the pieces are short, since the mean over a second of turning and rocking differs from the
+value in its middle, so a long interval between keyframes holds several. `pack` and `unpack` turn measurements into a
+few arrays, for files and between processes.
 
-Pieces are short, since a mean over a second of turning and rocking is not what is so in its
-middle; between keyframes that are further apart there are several.
-
-Measurements as a few arrays, for files and between processes.
-
-How late stamps may be, and where on the time line a measurement is put for that.
-
-A measurement stands at its stamp less the time offset that is assumed. What remains until the one that is estimated is
-bridged by a window, the motion at knots around the stamp (`rovgraph.kernels.linearization`). So the assumption need not
-be right, but the nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The assumption
-may be renewed while measurements come.
+`TimeOffsets` holds how late stamps may be. A measurement is placed at its stamp less the assumed time offset; a window,
+the motion at knots around the stamp (`rovgraph.kernels.linearization`), bridges the rest. So the assumption may be
+wrong, but the nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. It may be renewed
+while measurements arrive.
 """
 
 from collections import Counter
@@ -62,7 +58,7 @@ OLDEST_SIGNAL_S = 1.0  # a thruster's signal is believed to last that long
 def thruster_pieces(
     model: ModelAiding, signals: Sequence[Measurement], begin: float, end: float, samples: Array
 ) -> Iterator[Measurement | str]:
-    """What thrusters tell between two keyframes, each at the middle of its piece, or why a piece tells nothing.
+    """Thruster measurements between two keyframes, each at the middle of its piece, or why a piece has none.
 
     Parameters
     ----------
@@ -169,11 +165,11 @@ class TimeOffsets:
         return self.assumed.get(self.variable.get(sensor, ""), 0.0)
 
     def lag(self, sensor: str) -> Array | None:
-        """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""
+        """Range of the time offset of a sensor, shape (K,) [s]; None where it is not estimated."""
         return self.lags.get(self.variable.get(sensor, ""))
 
     def assume(self, c: Array) -> None:
-        """Renew the assumption by a calibration vector, shape (C,), as far as it was reckoned with."""
+        """Renew the assumed time offsets by a calibration vector, shape (C,), within the assumed range."""
         for name, lag in self.lags.items():
             self.assumed[name] = float(np.clip(np.mean(c[LAYOUT[name]]), lag[0], lag[-1]))
 
@@ -182,7 +178,7 @@ class TimeOffsets:
         return max((float(np.abs(calibration[n] - self.assumed[n]).mean()) for n in self.lags), default=0.0)
 
     def centred(self, calibration: Mapping[str, Array], reach: float) -> "TimeOffsets":
-        """Offsets that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
+        """Time offsets near the estimate, shape (n, 1) or (1,) each, within ``reach`` [s]."""
         assumed = self.assumed | {name: float(np.mean(calibration[name])) for name in self.lags}
         lags = {name: around(assumed[name], reach + float(np.ptp(calibration[name]))) for name in self.lags}
         return TimeOffsets(self.variable, lags, assumed)

@@ -1,9 +1,9 @@
-"""What has come of a dive, and the keyframes that are made of it, as arrays that grow.
+"""Assembly of a dive: all that has arrived, and the keyframes made of it, as arrays that grow.
 
 `Assembly.extend` is the only rule of assembly, compiled in `rovgraph.kernels.assembly`: called once for a log, and for
-each ping online. Every keyframe knows how much had come when it was made, so that a measurement that comes late is
-inserted and the keyframes since are made once more. Time offsets that are estimated are assumed anew for what is read
-from then on. What noise has been learnt, and how often places have been seen, stands with the keyframes.
+each ping online. Each keyframe stores how much had arrived when it was made, so that a late measurement is inserted and
+the keyframes since are made again. A renewed assumption of an estimated time offset holds for measurements that arrive
+from then on. Learnt noise, and the number of sightings of places, are stored with the keyframes.
 """
 
 import math
@@ -61,7 +61,7 @@ def assembly_of(
 
 
 class InsertResult(StrEnum):
-    """What became of a measurement."""
+    """Result of inserting a measurement."""
 
     IN = "taken"
     LATE = "later than the lag"
@@ -79,7 +79,7 @@ class Assembly:
     bias : ndarray, shape (6,), for preintegration
     believed : priors of the calibration; None = the configuration's
     assumed : how late stamps are; None = as these have it
-    learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
+    learn_noise : raise the IMU's noise to what its newest samples show, where the whole log is not yet available
     """
 
     config: Config
@@ -113,7 +113,7 @@ class Assembly:
         self._periods: list[float] = []
         self._gaps: list[float] = []  # times of samples after gaps, since the newest keyframe
         self._left_out: Counter[tuple[str, str]] = Counter()  # what has been forgotten
-        self._no_pieces: list[tuple[int, str]] = []  # keyframe, and why a piece before it tells nothing
+        self._no_pieces: list[tuple[int, str]] = []  # keyframe, and why a piece before it has no measurement
         self._order = np.empty(BUFFER, np.int64)
         self._dive = self._room(BUFFER, BUFFER, BUFFER)
         self._ahead = self._room(2, 0, 0)
@@ -191,7 +191,7 @@ class Assembly:
                 return InsertResult.AGAIN
             if self._closes(m.sensor):
                 self._due = min(self._due, m.time - self.time_offsets.of_sensor(m.sensor))
-        if self._no_imu:  # time goes on to it
+        if self._no_imu:  # its time advances to it
             self._insert_sample(m.time, np.zeros(6), m.row)
         return InsertResult.IN
 
@@ -354,7 +354,7 @@ class Assembly:
 
     @property
     def problem(self) -> Problem:
-        """The keyframes so far; nothing of it is written again but by `truncate`."""
+        """The keyframes so far; only `truncate` changes what has been written."""
         d, n, m, w = self._dive, len(self), int(self._dive.counts[at.ROWS]), int(self._dive.counts[at.WINDOWS])
         scaled = int(self._rule.scaled)
         return Problem(
@@ -508,7 +508,7 @@ class Assembly:
 
     @property
     def _events(self) -> Array:
-        """What has come, in the order of time, shape (e, VALUES + 2 D)."""
+        """Events so far, in the order of time, shape (e, VALUES + 2 D)."""
         if self._waiting:
             new, begin = self._waiting, self._come
             self._waiting, self._come = [], begin + len(new)
@@ -573,7 +573,7 @@ class Assembly:
         return self._no_imu or sensor == "dvl"
 
     def _about(self, sensor: str) -> list[int]:
-        """What kernels need to know of a sensor."""
+        """Parameters of a sensor for the kernels."""
         late = [s for s in self.names if self.time_offsets.lag(s) is not None]
         # the rate reaches these: by a lever arm, or by the motion of a turning body
         turned = self.instruments[sensor].rate_gain.any() or sensor == "thruster"
@@ -583,7 +583,7 @@ class Assembly:
     # measurements and samples
 
     def _insert_before_others(self, m: Measurement, place: Place) -> bool:
-        """Put a measurement at its place among those that have come; False = it is there already."""
+        """Insert a measurement in the order of time; False = it is there already."""
         k = len(self._events)
         while k > 0 and self._place_of(k - 1) > place:
             k -= 1
@@ -623,7 +623,7 @@ class Assembly:
         return out
 
     def _place_of(self, k: int) -> Place:
-        """Order of what has come: by time, and the DVL's before others."""
+        """Order of events: by time, and the DVL's before others."""
         if k < 0:
             return NEVER
         stamp, sensor, name = self._listed[k, [at.STAMP, at.SENSOR, at.NAME]].tolist()
@@ -661,7 +661,7 @@ class Assembly:
             self.truncate(n)
 
     def _take_period(self, period: float) -> None:
-        """Learn from the first samples what a gap is."""
+        """Find the regular sample interval, beyond which there is a gap, from the first samples."""
         if len(self._periods) < at.PERIODS and not self._no_imu:
             self._periods.append(period)
             self._steps[len(self._periods) :] = GAP_PERIODS * float(np.median(self._periods))
@@ -703,7 +703,7 @@ class Assembly:
         return events
 
     def _pieces(self, begin: int) -> Array:
-        """What thrusters tell of the intervals that end with keyframes from ``begin`` on, as events."""
+        """Thruster measurements of the intervals that end with keyframes from ``begin`` on, as events."""
         model = cast(ModelAiding, self.instruments["thruster"].model)
         table, gone, out = self._table, int(self._dive.counts[at.FORGOTTEN]), [self._listed[:0]]
         for k in range(begin, len(self)):

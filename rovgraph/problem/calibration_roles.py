@@ -1,4 +1,4 @@
-"""What of the calibration is estimated, and what is considered."""
+"""Roles of the calibration variables: which are estimated, and which are considered."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from rovgraph.model.gauss_markov import walked
 
 @dataclass(frozen=True)
 class CalibrationRoles:
-    """What of the calibration a dive's estimate holds.
+    """Roles of the calibration variables in a dive's estimate.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class CalibrationRoles:
         return replace(self, walks={**self.walks, name: belief.walk}, considered=left, time_constants=lasting)
 
     def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
-        """How one that walks moves in a time: `rovgraph.model.gauss_markov.walked`."""
+        """Factor and added sd of one that walks, in a time: `rovgraph.model.gauss_markov.walked`."""
         return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)
 
 

@@ -1,4 +1,4 @@
-"""What is believed where a dive begins."""
+"""Initial conditions: the estimate and covariance where a dive begins."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from rovgraph.sensors.instruments import Instrument, instruments
 
 @dataclass(frozen=True)
 class StatePrior:
-    """What is believed at the first keyframe.
+    """Prior at the first keyframe.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class StatePrior:
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What a dive has revealed of its instruments, in place of what the configuration says.
+    """Noise and constants found in a dive, in place of the configuration's.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Beliefs:
     noise: Mapping[str, float] = field(default_factory=dict)
 
     def with_more(self, more: "Beliefs") -> "Beliefs":
-        """What was revealed before, and what is now, of the noise by that time."""
+        """The findings so far joined with new ones, of the noise by that time."""
         noise = {s: more.noise.get(s, 1.0) * self.noise.get(s, 1.0) for s in {**self.noise, **more.noise}}
         return Beliefs({**self.calibration, **more.calibration}, noise)
 
@@ -102,7 +102,7 @@ class InitialConditions:
         return [*self.instruments, *(() if has_constant_velocity(self.config) else ("imu",))]
 
     def dump(self) -> dict[str, Any]:
-        """What `restored` makes it of again, as plain values and arrays."""
+        """Plain values and arrays from which `restored` makes it again."""
         prior = self.prior
         return {
             "config": self.config.model_dump(mode="json"),

@@ -1,14 +1,14 @@
-"""What sensors have measured of a dive, linearised about states of its keyframes.
+"""Measurements of a dive, linearised about states of its keyframes.
 
 The equations are compiled (`rovgraph.kernels.linearization`): the state at a measurement's own time, the prediction
-there, whitening. A model that no kernel knows is given the states at its measurements' times, all at once, and gives
+there, whitening. A model without a kernel takes the states at all its measurements' times at once, and returns
 predictions and Jacobians there.
 
 Robust losses are applied by reweighting: the weight of a measurement is
 rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero where it is
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 
-Pieces of a long dive, so that what is large of a measurement is there for some of them at a time.
+A long dive is linearised in pieces, so that the Jacobians of a piece only are in memory.
 """
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
@@ -34,14 +34,14 @@ from rovgraph.problem.problem import Index, Problem
 from rovgraph.sensors import SENSORS, innovation
 from rovgraph.sensors.instruments import Instrument
 
-Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are let in
+Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are admitted
 _COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 _STATE = slice(9, 12), slice(12, 15), slice(15, 21)  # position, velocity and bias in a state vector
 _FRAME = {"velocity": at.SEES_VELOCITY, "heading": at.SEES_HEADING, "position": at.SEES_POSITION}
 
 
 def compiled(instrument: Instrument) -> bool:
-    """Whether kernels know an instrument's equation."""
+    """Whether kernels have an instrument's equation."""
     return hasattr(instrument.model, "kind")
 
 
@@ -82,7 +82,7 @@ def kernel_states(state: State) -> States:
 
 @dataclass(frozen=True)
 class KeyframeRows:
-    """Measurements of one keyframe that the kernels know.
+    """Measurements of one keyframe whose equations the kernels have.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ class Measurements:
 
     @property
     def believed(self) -> NDArray[np.bool_]:
-        """False where the vehicle cannot have been: not let in unless the optimum says otherwise, shape (n,)."""
+        """False where the vehicle cannot have been: rejected unless the optimum fits them, shape (n,)."""
         return self.problem.believed[self.index]
 
     @property
@@ -250,7 +250,7 @@ class Measurements:
         return np.asarray(self.W @ self.predict(state)[1][name])
 
     def predict(self, state: State) -> tuple[Array, Jacobians]:
-        """Predictions of a model that no kernel knows, shape (n, dim), and Jacobians by the keyframes' variables."""
+        """Predictions of a model without a kernel, shape (n, dim), and Jacobians by the keyframes' variables."""
         there, rate_b, F = self._placed(state, True)
         predicted, H = self.instrument.model.predict(there, rate_b)
         n, stacked = len(self), np.zeros((len(self), predicted.shape[1], MOTION))
@@ -373,7 +373,7 @@ def gates_of(seen: Seen) -> Gates:
 
 
 def cost_at_gate(instrument: Instrument) -> float:
-    """Robust cost of a measurement at its gate; infinite where there is none."""
+    """Robust cost of a measurement at its gate; infinite without a gate."""
     if instrument.gate_sd is None:
         return np.inf
     return float(_cost_and_weight(np.array([instrument.gate_sd**2]), instrument.loss, instrument.model.dim)[0][0])
@@ -388,7 +388,7 @@ def weights_of(seen: Seen, gates: Gates) -> dict[str, Array]:
 
 
 def measurement_cost(seen: Seen, gates: Gates) -> float:
-    """Robust cost of the measurements that are let in."""
+    """Robust cost of the admitted measurements."""
     return sum(
         float(loss_and_weight(measured.normalised(state), measured.instrument.loss)[0] @ gates[sensor])
         for sensor, measured, state in seen
@@ -414,6 +414,6 @@ LENGTH = 8192  # keyframes or measurements: their Jacobians by everything take a
 
 
 def pieces(begin: int, end: int) -> Iterator[slice]:
-    """What lies from ``begin`` to before ``end``, a piece after the other."""
+    """The rows from ``begin`` to before ``end``, a piece after the other."""
     for first in range(begin, end, LENGTH):
         yield slice(first, min(first + LENGTH, end))

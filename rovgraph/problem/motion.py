@@ -1,25 +1,18 @@
-"""IMU preintegration between keyframes (Forster et al. 2017; Carlone et al. 2014).
+"""Motion between keyframes: IMU preintegration, scale errors of the IMU, and dives without an IMU.
 
-The state's origin is the IMU: its position and velocity are what an accelerometer can
-know without the angular acceleration that (3.1) neglects. Samples are rotated into body
-axes first, so biases are in body axes. The equations are in `rovgraph.kernels.preintegration`.
+Preintegration follows Forster et al. (2017) and Carlone et al. (2014); its equations are in
+`rovgraph.kernels.preintegration`. The state's origin is the IMU: there the accelerometer needs no angular acceleration,
+which (3.1) neglects. Samples are rotated into body axes first, so biases are in body axes.
 
-Motion of a dive without an IMU: the vehicle goes on as it went (`rovgraph.kernels.motion`).
+Scale errors of accelerometer and gyro act as biases over a short time. A sample is (1 + k) times the true value,
+component by component along the IMU's axes, plus the bias. Over an interval of a fraction of a second k times the mean
+signal may stand for k times each sample, so that the motion that was integrated without k serves with the bias
+b + S k, where S holds the mean signal (`scale_to_bias`). The same S takes every derivative by the bias to one by k.
 
-To an assembler the dive has an IMU whose samples are all zero, in a world without gravity: one at the time of every
-measurement, which says that time goes on. A silence of all sensors is an outage of that IMU
-(`rovgraph.kernels.motion`).
-
-Between a keyframe and a measurement no noise is reckoned with, so what is measured at one time makes a keyframe, but
-for what is within ``graph.min_gap_s`` of one.
-
-Scale errors of accelerometer and gyro: over a short time they act as biases.
-
-A sample is (1 + k) times what is so, component by component along the IMU's axes, and the bias
-on top. Over an interval of a fraction of a second its k times the mean signal may stand for
-k times each sample, so that the motion that was integrated without k serves with the bias
-b + S k, where S holds the mean signal (`scale_to_bias`). The same S takes every derivative by the bias
-to one by k.
+Without an IMU the vehicle moves with nearly constant velocity (`rovgraph.kernels.motion`). For the assembly the dive
+then has an IMU whose samples are all zero, in a world without gravity: one at the time of every measurement, which
+marks that time. When all sensors are silent, that IMU has an outage. No noise is modelled between a keyframe and a
+measurement, so every measurement time makes a keyframe, except within ``graph.min_gap_s`` of one.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -48,12 +41,12 @@ def motion_model(config: Config, available: Collection[str]) -> str:
 
 
 def has_constant_velocity(config: Config) -> bool:
-    """Whether a dive is reckoned without an IMU, once `motion_model` is resolved."""
+    """Whether a dive is estimated without an IMU, once `motion_model` is resolved."""
     return config.motion.model == "constant_velocity"
 
 
 def gravity(config: Config) -> float:
-    """Gravity that the motion is integrated with, none where no accelerometer feels it [m/s^2]."""
+    """Gravity that the motion is integrated with, 0 without an accelerometer [m/s^2]."""
     return 0.0 if has_constant_velocity(config) else config.environment.gravity_mps2
 
 
@@ -69,7 +62,7 @@ INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly si
 
 @dataclass(frozen=True)
 class PreintegrationParams:
-    """What is believed of the IMU and of where it moves.
+    """Noise of the IMU, gravity and Earth rate for preintegration.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """A dive as arrays: n keyframes, the motions between them, and what was measured at them and after them.
 
-Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter, and whoever looks at what they have found.
+Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter. So do statistics and alarms.
 """
 
 from collections.abc import Mapping, Sequence
@@ -242,8 +242,8 @@ class Problem:
     def motion_residuals(self, state: State) -> Array:
         """Whitened residuals of the motions, shape (n - 1, 15), at a state of all keyframes.
 
-        Columns 9 to 14 are the changes of the biases, those before rotation, position and velocity beyond what the
-        former tell of the latter.
+        Columns 9 to 14 are the changes of the biases, those before rotation, position and velocity given these
+        changes.
         """
         shift, r = np.empty((0, 6)), np.empty((len(self.motions), MOTION))
         if len(self.scales):

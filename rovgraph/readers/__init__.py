@@ -1,6 +1,8 @@
-"""Native files of instruments, vehicles and robots, as channels of a log, and tracks as files that others open.
+"""Native files of instruments, vehicles and robots become a log.
 
-`recording` is what a file becomes, `formats` finds and runs its reader; each format is a module of its own.
+May import `rovgraph.diagnosis`, `log`, `sensors`, `model` and what is below. Begin with `formats`, which recognises a
+file and runs its reader (each format is a module of its own), and `recording`, which holds what was read. Then
+`selection` chooses channels, `clocks` joins their clocks, and `merging` makes one log.
 """
 
 from rovgraph.readers.formats import Format, ReadingOptions, formats, read_recording, recognise

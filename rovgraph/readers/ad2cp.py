@@ -29,7 +29,7 @@ from rovgraph.readers.stamps import unix_of_calendar
 
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
-ZONE_SD_S = 6 * 3600.0  # of a clock whose time zone nobody states
+ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 ENU, XYZ, BEAM = range(3)  # coordinates of a Signature's velocities
 BEAM_ANGLE = np.deg2rad(25.0)  # of a Signature, as its own transformation matrix has it
 NO_MERIT = 65535  # figure of merit of a beam that heard nothing
@@ -161,7 +161,7 @@ def _either(pair: Array) -> Array:
 
 
 def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> NortekTrack:
-    """Bottom or water track of a DVL: the status says what of it is valid, two estimates of Z are averaged."""
+    """Bottom or water track of a DVL: by the status for validity, two estimates of Z are averaged."""
     said, there = gathered(content, DVL_FIELDS, found.at.get(kind, []), found.size.get(kind, []), DVL_FIELDS.itemsize)
     said = said[there]
     status = said["status"]
@@ -179,7 +179,7 @@ def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> Nortek
 
 
 def _time(date: NDArray[np.uint8], fraction: NDArray[np.uint16]) -> Array:
-    """Seconds since 1970 of calendar dates, shape (n,), NaN for what is none; ``fraction`` is in 0.1 ms."""
+    """Seconds since 1970 of calendar dates, shape (n,), NaN for invalid ones; ``fraction`` is in 0.1 ms."""
     year, month, day, hour, minute, second = date.astype(np.int64).T
     return unix_of_calendar(year + 1900, month + 1, day, hour, minute, second) + 1e-4 * fraction
 

@@ -1,10 +1,7 @@
-"""What ArduPilot's parameters say of its sensors, for its own logs and for MAVLink.
+"""ArduPilot's parameters, depth from pressure, and valid satellite fixes, for its own logs and for MAVLink.
 
-Parameters: https://ardupilot.org/sub/docs/parameters.html.
-
-Depth from pressure, and which pressure is that of the surface.
-
-Satellite fixes of an autopilot, without those that are none.
+`surface_pressure` finds which pressure is that of the surface. Parameters:
+https://ardupilot.org/sub/docs/parameters.html.
 """
 
 from collections.abc import Collection, Mapping
@@ -27,7 +24,7 @@ def surface_pressure(stated: float | None, pressure: Array) -> tuple[float, str,
 
     Parameters
     ----------
-    stated : what the file says it is [Pa], None = it says nothing
+    stated : the file's own value [Pa], None = without one
     pressure : ndarray, shape (n,), all that were measured [Pa]
 
     Returns
@@ -99,7 +96,7 @@ def depth_of(
 
 
 def surface_of(instance: int, pressure: Array, parameters: Mapping[str, float]) -> tuple[float, str, bool]:
-    """Pressure at the surface [Pa], as `rovgraph.readers.ardupilot.surface_pressure`; arguments of `depth_of`."""
+    """Pressure at the surface [Pa], by `surface_pressure`; arguments of `depth_of`."""
     names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
     return surface_pressure(next((parameters[name] for name in names if name in parameters), None), pressure)
 
@@ -110,7 +107,7 @@ def density_of(parameters: Mapping[str, float]) -> float:
 
 
 def thrusters(outputs: Mapping[int, Array], parameters: Mapping[str, float]) -> dict[str, Array]:
-    """Drive signals, -1 to 1, of the outputs that drive motors 1, 2, ...; {} where parameters do not say which.
+    """Drive signals, -1 to 1, of the outputs that drive motors 1, 2, ...; {} where parameters do not state them.
 
     Parameters
     ----------
@@ -127,7 +124,7 @@ def thrusters(outputs: Mapping[int, Array], parameters: Mapping[str, float]) -> 
 
 
 def settings(sensors: Collection[str], parameters: Mapping[str, float]) -> tuple[dict[str, Any], list[str]]:
-    """What parameters say of a configuration, and warnings.
+    """A configuration from parameters, and warnings.
 
     Parameters
     ----------
@@ -145,14 +142,14 @@ def settings(sensors: Collection[str], parameters: Mapping[str, float]) -> tuple
     return found, [unknown] if "ahrs" in sensors else []
 
 
-NO_DILUTION = 99.0  # and more: how receivers say that they do not know their dilution of precision
+NO_DILUTION = 99.0  # and more: a receiver's mark of an unknown dilution of precision
 RANGE_SD_M = 3.0  # of a satellite's range; with the dilution of precision that of a fix
 ONE_POINT = "all fixes are of one point, which no receiver does: the origin of the dive, and no fixes"
 FEW = 10  # fixes of one point that may be a vehicle at rest
 
 
 def new_fixes(stamp: Array, lat: Array, lon: Array) -> NDArray[np.bool_]:
-    """Which fixes say something new: those that lie somewhere and do not repeat the one before.
+    """Which fixes are new: those with a position that do not repeat the one before.
 
     Parameters
     ----------

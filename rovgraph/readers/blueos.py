@@ -1,4 +1,4 @@
-"""MCAP recordings of BlueOS: MAVLink messages as JSON, as mavlink2rest writes them, and what else a companion says.
+"""MCAP recordings of BlueOS: MAVLink messages as JSON, as mavlink2rest writes them, and other topics of a companion.
 
 A message stands on the topic ``mavlink/<system>/<component>/<NAME>`` and, in some versions, a second time on
 ``mavlink/out``. Names of enumerations stand for their numbers, and extensions of MAVLink 2 may be missing. Sources:
@@ -104,7 +104,7 @@ def _sender(parts: list[str]) -> Sender:
 
 
 def _take(gatherer: Gatherer, data: bytes, received: float) -> None:
-    """Count a message, and take it if it tells of a sensor."""
+    """Count a message, and take it if it has sensor data."""
     try:
         said = json.loads(data)
         header, fields = said["header"], said["message"]
@@ -119,7 +119,7 @@ def _take(gatherer: Gatherer, data: bytes, received: float) -> None:
 def _value(value: Any) -> Any:
     """A field as pymavlink has it: numbers for names of enumerations, a text for a list of characters."""
     if value is None:
-        return math.nan  # JSON knows no other
+        return math.nan  # JSON has no other
     if isinstance(value, dict):
         return value["bits"] if "bits" in value else NUMBERS.get(value.get("type", ""), -1)
     if isinstance(value, list) and value and isinstance(value[0], str):
@@ -151,6 +151,6 @@ def _inflated(compression: bytes, data: bytes) -> bytes:
             import lz4.frame
 
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data))
-    except Exception:  # not installed, or damaged: `read` says which
+    except Exception:  # not installed, or damaged: `read` reports which
         return b""
     return data

@@ -1,8 +1,8 @@
-"""Cerulean's Tracker 650: sentences of how far the vehicle went since the last one.
+"""Cerulean's Tracker 650: sentences with the displacement since the last one.
 
-``$DVPDL,time us,interval us,d roll,d pitch,d yaw,dx,dy,dz,confidence`` and ``$DVPDX``, which goes on. A way over its
-interval is a mean velocity, of the middle of it. Without confidence it is a lost ping, whatever stands in it. The turns
-are always zero. Source: Cerulean Sonar, Tracker 650 Communication Protocol.
+``$DVPDL,time us,interval us,d roll,d pitch,d yaw,dx,dy,dz,confidence`` and ``$DVPDX``, which has more fields. A
+displacement over its interval is a mean velocity, at the middle of it. With zero confidence it is a lost ping, whatever
+its values. The turns are always zero. Source: Cerulean Sonar, Tracker 650 Communication Protocol.
 """
 
 import re

@@ -1,14 +1,13 @@
-"""Several recordings on one clock, that of the IMU; or Unix time, where the IMU's clock is known in it.
+"""Joins several recordings on one clock: the IMU's, or Unix time where the IMU's clock is known in it.
 
-Clocks of one file whose Unix time is known, or that share arrivals, form an axis. Axes are joined by what the user
-knows (a shift), by Unix time, or by the motion that both show (`synchronise`); what motion contradicts by more than
+Clocks of one file whose Unix time is known, or that share arrivals, form an axis. `join_clocks` joins axes by a shift
+that the user states, by Unix time, or by the motion that both show; a shift that motion contradicts by more than
 `AGREE_S` is corrected, with a warning.
 
-How far two clocks are apart, by the motion that both recordings show.
-
-Every lag is searched first (`comparisons`). The best one counts where it explains the motion far better than any
-other, and least squares then give the offset and the drift with their standard deviations, these by leaving out one
-part of the dive after the other.
+`find_offset` finds the offset of two clocks by the motion that both recordings show. It searches all lags first
+(`rovgraph.readers.lag_search`). The best lag is accepted where it explains the motion far better than any other, and
+least squares then give the offset and the drift with their standard deviations, these by leaving out one part of the
+dive after the other.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -57,7 +56,7 @@ class Offset:
     seconds, sd : at the time ``at`` of clock A [s]
     drift, drift_sd : of B against A
     at : middle of the overlap, by clock A [s]
-    overlap : that both recordings know [s]
+    overlap : time that both recordings cover [s]
     explained : part of the motion's square that the two share
     how : what was compared
     """
@@ -78,7 +77,7 @@ class Offset:
 
 
 def find_offset(a: MotionSignals, b: MotionSignals) -> Offset | None:
-    """The offset of two recordings' clocks, by all quantities that both show; None where these do not tell.
+    """The offset of two recordings' clocks, by all quantities that both show; None where these do not determine it.
 
     Candidates are the lags at which all together agree best; each is refined by every quantity. The best candidate
     counts if it explains the motion far better than any other, and the quantity with the least sd gives its offset.
@@ -247,7 +246,7 @@ def _step(
 
 UNKNOWN_ZONE_S = 1800.0  # sd of a clock that may show local time
 AGREE_S = 0.5  # stamps that motion contradicts by less stay: a sensor may be late by as much
-SYSTEMATIC_S = 0.06  # by motion 12 simulated dives of two minutes were 0.03 s off, rms, where it claims 0.01 s
+SYSTEMATIC_S = 0.06  # by motion 12 simulated dives of two minutes were 0.03 s off, rms, at an sd of 0.01 s
 SURE = 3.0  # standard deviations of a contradiction
 SINCE_2000 = 9.5e8  # Unix time before is that of a clock that was never set [s]
 ARRIVAL_WINDOW_S = 60.0  # over which the least delay of a transport is taken
@@ -408,7 +407,7 @@ def join_clocks(
 
 
 def _axes(file: int, recording: Recording) -> tuple[list[_Axis], list[str]]:
-    """The axes of a file, and what to say of clocks that were never set."""
+    """The axes of a file, and warnings of clocks that were never set."""
     known: dict[str, ClockLine] = {}
     sources: dict[str, tuple[str, float]] = {}
     said = []

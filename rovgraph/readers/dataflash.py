@@ -1,9 +1,7 @@
-"""ArduPilot's own logs, DataFlash ``.BIN``: what a vehicle with ArduSub records on board.
-
-What the messages of a DataFlash log say of each sensor, in SI.
+"""ArduPilot's own logs, DataFlash ``.BIN``, which a vehicle with ArduSub records on board: each sensor's values in SI.
 
 Fields and their meaning: https://ardupilot.org/sub/docs/logmessages.html. Vectors are along the vehicle's axes,
-forward, starboard, down: ArduPilot turns what its sensors say by their orientation.
+forward, starboard, down: ArduPilot turns its sensors' values by their orientation.
 """
 
 from collections import Counter
@@ -51,7 +49,7 @@ from rovgraph.readers.stamps import longest_boot
 DOWN, GOOD = 25, 4  # a rangefinder's orientation and status
 FIX_3D = 3
 LATE_S = 1.0  # a sample's own stamp is at most so much before its message
-SOME = 10_000  # values that something is told by
+SOME = 10_000  # values enough for a judgement
 
 # unit's label -> factor to SI and radians; a field in microtesla, latitude and longitude in degrees
 _SI = {
@@ -74,7 +72,7 @@ _XYZ = "XYZ"
 
 @dataclass
 class Findings:
-    """What is said beside the channels.
+    """Warnings and settings beside the channels.
 
     Attributes
     ----------
@@ -162,7 +160,7 @@ class DataflashSource:
         return replace(self, messages=self.messages.take(keep))
 
     def quietly(self) -> "DataflashSource":
-        """The same, of which nothing is said: an alternative that may not be used."""
+        """The same without warnings: an alternative that may not be used."""
         return replace(self, findings=Findings())
 
     def channel(self, sensor: str, columns: Mapping[str, Array], fields: str, frame: str = "") -> Channel:
@@ -292,7 +290,7 @@ def _interval(source: DataflashSource) -> Array:
 
 
 def velocity_estimate(source: DataflashSource) -> Channel | None:
-    """VISV: velocities that a companion sends, of which nothing says along which axes."""
+    """VISV: velocities that a companion sends, along axes that the log does not state."""
     velocity = np.column_stack([source.si(f"V{axis}") for axis in _XYZ])
     columns = _dvl(source.time(), velocity, np.asarray(np.isfinite(velocity).all(axis=1)))
     return source.channel("dvl", columns, "VX, VY, VZ", BODY)
@@ -304,7 +302,7 @@ def _dvl(time: Array, velocity: Array, valid: NDArray[np.bool_]) -> dict[str, Ar
 
 
 def fixes(source: DataflashSource) -> Channel | None:
-    """GPS: fixes in three dimensions that say something new."""
+    """GPS: new fixes in three dimensions."""
     source = source.where(source.raw("Status") >= FIX_3D, "no fix in three dimensions")
     lat, lon = source.si("Lat"), source.si("Lng")
     if (point := one_point(lat, lon)) is not None:
@@ -424,7 +422,7 @@ def _imu_instance(choose: Mapping[str, str]) -> int | None:
 
 
 def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> None:
-    """Say which other IMUs there are.
+    """Report the other IMUs.
 
     Raises
     ------
@@ -439,7 +437,7 @@ def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> Non
 
 
 def _one_boot(contents: Contents, findings: Findings) -> dict[str, DataflashMessages]:
-    """The longest part of the log in which time goes on, by the messages that are most frequent.
+    """The longest part of the log in which time increases, by the messages that are most frequent.
 
     Places are forgotten, which nothing else needs.
     """
@@ -492,7 +490,7 @@ def _channels(
     findings: Findings,
     choose: Mapping[str, str],
 ) -> list[Channel]:
-    """Channels of all sensors, the preferred one of each first; what is said of the others is left out.
+    """Channels of all sensors, the preferred one of each first; warnings on the others are left out.
 
     Messages are forgotten where they have become channels, so that a long log is in memory once.
     """
@@ -562,7 +560,7 @@ def _firmware(messages: DataflashMessages | None) -> list[str]:
 
 
 def _describe(contents: Contents, made: list[Channel], findings: Findings) -> None:
-    """Say what looks wrong with the log."""
+    """Warn of what looks wrong with the log."""
     if contents.damaged:
         findings.warnings.append(
             f"{contents.damaged_bytes} bytes in {contents.damaged} places are no messages and are skipped"

@@ -1,6 +1,6 @@
 """Messages of an ArduPilot DataFlash log as arrays, many at a time.
 
-A log is a row of messages: 0xA3 0x95, a type, and as many bytes as the type's format says. Formats are messages
+A log is a row of messages: 0xA3 0x95, a type, and as many bytes as the type's format states. Formats are messages
 themselves (FMT); units and multipliers of their fields too (UNIT, MULT, FMTU). There are no checksums. Source:
 https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html and libraries/AP_Logger of ArduPilot.
 
@@ -23,7 +23,7 @@ from rovgraph.log.disk_columns import GrowingColumn, taken
 
 HEAD = b"\xa3\x95"
 FMT = 128  # type of the message that defines all others, itself too
-INSTANCE = ("I", "Instance")  # fields that say which of several sensors it is
+INSTANCE = ("I", "Instance")  # fields with the number of the sensor
 BLOCK = 1 << 22  # bytes walked at a time
 _PLACE = " place"  # no field has a blank in its name
 
@@ -90,7 +90,7 @@ class DataflashMessages:
     ----------
     fields : field -> ndarray, shape (n,), as stored: without multipliers; integers of 64 bits as floats. Not to be
         changed: long ones are in temporary files (`rovgraph.log.disk_columns`)
-    units : field -> its unit's label, such as "m/s/s"; "" where the file does not say
+    units : field -> its unit's label, such as "m/s/s"; "" where the file does not state it
     multipliers : field -> factor that makes that unit of what is stored
     """
 
@@ -115,7 +115,7 @@ class DataflashMessages:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a log holds.
+    """Contents of a log.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Contents:
     counts : name -> how many there are, of all
     instances : name -> instances that there are, of those of which one was wanted
     unlike : name -> how many were wanted, but have other fields or types of them than the first of that name
-    damaged : stretches of bytes that are no message
+    damaged : stretches of bytes between messages
     damaged_bytes : bytes in them, without a message that the end of the file cuts off
     cut_off : bytes of that message
     """
@@ -245,7 +245,7 @@ class _Walk:
             self._sane |= final > index
             place, after = int(heads.at[final]), int(heads.after[final])
             if after > heads.end or (after > place and after + 2 > heads.end and not last):
-                break  # goes on in the next block, or is cut off by the end of the file
+                break  # continues in the next block, or is cut off by the end of the file
             if heads.sound[final]:
                 taken[final] = self._sane = True
                 place = after
@@ -316,7 +316,7 @@ class _Walk:
         return [n for n in self._wanted.get(form.name, ()) if n in form.multipliers]
 
     def contents(self, cut_off: int) -> Contents:
-        """All that was walked."""
+        """Contents of the bytes read so far."""
         places = {name: columns.pop(_PLACE).array() for name, columns in self._columns.items()}
         found = {
             name: DataflashMessages({n: column.array() for n, column in c.items()}) for name, c in self._columns.items()
@@ -353,7 +353,7 @@ def _dtype_in_memory(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def instances(rows: NDArray[Any]) -> NDArray[Any] | None:
-    """Of which instance rows of messages are, shape (n,); None where their format knows none."""
+    """Instance of each row of messages, shape (n,); None where their format has no instances."""
     return next((rows[name] for name in INSTANCE if name in (rows.dtype.names or ())), None)
 
 

@@ -1,8 +1,7 @@
 """Native formats, recognised by their content: one module each, registered here or by an entry point.
 
-A package of its own adds a format with an entry point of the group ``rovgraph.formats`` that names a `Format`.
-
-What a file is that is given as a log and is none, and which command reads it.
+A package of its own adds a format with an entry point of the group ``rovgraph.formats`` that names a `Format`. Files
+that are not logs are explained, with the command that reads them.
 """
 
 import gzip
@@ -51,14 +50,14 @@ GROUP = "rovgraph.formats"
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """What a user may say of how files are read.
+    """A user's options for reading files.
 
     Attributes
     ----------
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
     table : names, units, angles and times of rovgraph's own log, by a configuration (docs/log-format.md)
-    arrival : stamps are to be those of arrival, at least some: rows whose own stamps are wrong are kept
+    arrival : use the stamps of arrival, at least some: rows whose own stamps are wrong are kept
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
@@ -226,7 +225,7 @@ FOXGLOVE = (b'"topic"', b'"message"', b'"receiveTime"')  # of a message exported
 
 
 def purpose(path: Path, head: bytes) -> str:
-    """What a file of this program's is good for; "" where it is none of them.
+    """The use of a file of this program's; "" for other files.
 
     Parameters
     ----------
@@ -260,5 +259,5 @@ def is_text(head: bytes) -> bool:
 
 
 def refusal(path: Path, titles: Sequence[str]) -> str:
-    """Why a file that is no table of text cannot be read."""
+    """Why a file that is not a table of text cannot be read."""
     return f"{path}: is binary data in an unknown format; expected one of: {', '.join(titles)}"

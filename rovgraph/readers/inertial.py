@@ -1,4 +1,4 @@
-"""What inertial units export, as channels of a log: units of columns, axes, and the world of an attitude.
+"""Exports of inertial units as channels of a log: units of columns, axes, and the world of an attitude.
 
 Where a file states no unit, that of the maker's documentation counts, unless gravity or an instrument's range rules it
 out. Gravity also tells whether z points up, and whether an attitude is relative to NED or to ENU.
@@ -85,7 +85,7 @@ class InertialMeasurement:
     sensor, label, warning : of a `InertialSource`
     time : ndarray, shape (n,) [s]
     values : ndarray, shape (n, k), columns as in `COLUMNS`, SI and radians, a field in microtesla
-    world : of an attitude, a key of `WORLDS`; "" = gravity tells
+    world : of an attitude, a key of `WORLDS`; "" = found by gravity
     true_north : an attitude's yaw is relative to it, not to magnetic north
     """
 
@@ -109,7 +109,7 @@ class InertialMeasurement:
 
 @dataclass
 class Account:
-    """What is said of a file.
+    """Warnings and settings of a file.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Account:
     left: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def count(self, table: TextTable) -> None:
-        """What of a table was not read: rows, and columns that hold no measurement of a log."""
+        """Count the unread parts of a table: rows, and columns without a measurement of a log."""
         self.left.update({("rows", why): count for why, count in table.left.items()})
         self.left["columns", f"no measurement that a log has: {', '.join(table.others)[:120]}"] += len(table.others)
 
@@ -146,7 +146,7 @@ def name_and_unit(written: str) -> tuple[str, str]:
 def measured_of(
     path: Path, table: TextTable, sources: Sequence[InertialSource], time: Array, step: float | None, account: Account
 ) -> list[InertialMeasurement]:
-    """What the columns of a table hold.
+    """Measured quantities in the columns of a table.
 
     Parameters
     ----------

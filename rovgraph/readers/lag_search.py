@@ -1,4 +1,4 @@
-"""Two recordings of one motion: how well what one shows is explained by what the other shows, at any lag.
+"""Lag search between two recordings of one motion: how well one explains the other, at any lag.
 
 For a quantity y on clock A and the same one x on clock B, both as changes over a window,
 
@@ -11,13 +11,11 @@ DVL's arm from the IMU,
 
 The sums of these least-squares problems at all lags come from FFTs. R is then the best of a set of rotations that is
 dense enough for any mounting at right angles, and any about the vertical, each with the arm that fits it best. In waves
-the arm's part may be most of the motion: it counts for no lag.
+the arm's part may be most of the motion: it is not counted in favour of a lag.
 
-The motion that the sensors on one clock show, in quantities that need no mounting to be compared.
-
-Turning about the vertical, depth, speed, the velocity along a DVL's own axes, and the IMU's acceleration without
-gravity along its own axes. Integrated quantities are compared by their changes over a window, so that biases and
-constant offsets drop out.
+The quantities compared need no mounting: turning about the vertical, depth, speed, the velocity along a DVL's own axes,
+and the IMU's acceleration without gravity along its own axes. Integrated quantities are compared by their changes over
+a window, so that biases and constant offsets drop out.
 """
 
 from dataclasses import dataclass
@@ -83,7 +81,7 @@ class MotionSignal:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """What an IMU feels without gravity, along its own axes.
+    """An IMU's acceleration without gravity, along its own axes.
 
     Attributes
     ----------
@@ -136,7 +134,7 @@ class MotionSignals:
 
 
 def motion_of(log: Log) -> MotionSignals:
-    """What the sensors of a log show, each along its own axes."""
+    """Motion by the sensors of a log, each along its own axes."""
     signals = []
     inertial = inertial_motion(log, Config())
     if inertial is not None:
@@ -183,12 +181,12 @@ ARM_INFORMATION = np.array([0.0, 0.0, 0.0, *[ARM_SD**-2] * 3])
 
 @dataclass(frozen=True)
 class Sums:
-    """What is left unexplained at every lag.
+    """Sums of the unexplained squares at every lag.
 
     Attributes
     ----------
     lags : ndarray, shape (l,) [s]
-    seconds : ndarray, shape (l,), that both recordings know
+    seconds : ndarray, shape (l,), that both recordings cover
     total, error : ndarray, shape (l,), sums of squares before and after
     parameters : ndarray, shape (l, p), of the best fit
     """
@@ -209,7 +207,7 @@ class SignalPair(Protocol):
 
     @property
     def name(self) -> str:
-        """What is compared."""
+        """Name of the compared quantity."""
 
     @property
     def spans(self) -> tuple[Array, Array]:
@@ -227,10 +225,10 @@ class SignalPair(Protocol):
         """Every lag that leaves an overlap."""
 
     def observed(self, times: Array) -> tuple[Array, Array]:
-        """What clock A shows at its times (n,), NaN where not known: shape (n, m), and for `regressors`, (n, k)."""
+        """Values on clock A at its times (n,), NaN where not known: shape (n, m), and for `regressors`, (n, k)."""
 
     def regressors(self, shown: Array, others: Array) -> Array:
-        """What the parameters (p,) are multiplied by, at times of clock B, shape (n, m, p).
+        """Regressors, multiplied by the parameters (p,), at times of clock B, shape (n, m, p).
 
         Parameters
         ----------
@@ -333,7 +331,7 @@ class Accelerations:
         normal = np.einsum("lm,tkn->tlkmn", np.eye(3), own) + np.einsum("tlmkn->tlkmn", mixed + turned)
         normal = (normal + np.einsum("tmlnk->tlkmn", mixed)).reshape(-1, 81)
         right = _correlate(a, dv) + _correlate(np.einsum("til,ti->tl", G, a), v)
-        # and those of the arm's part Y l, which clock A alone knows, with what it explains without the DVL
+        # and those of the arm's part Y l, which only clock A has, with what it explains without the DVL
         Y = _by_arm(both[:, 3:6], both[:, 6:9])
         information = _correlate(np.einsum("tij,tik->tjk", Y, Y), seen).reshape(-1, 3, 3)
         ridge = RIDGE * np.trace(information, axis1=1, axis2=2) + TINY

@@ -1,16 +1,12 @@
-"""What MAVLink messages of an autopilot say of its sensors: one table for live links and for recordings.
+"""MAVLink messages of an autopilot as readings of its sensors, for live links and for recordings.
 
 Sources: the message definitions at https://mavlink.io/en/messages/common.html; units of RAW_IMU as ArduPilot fills
 it. Values come in the order of `COLUMNS`, in SI and radians; vectors along the vehicle's axes, forward, starboard,
-down; headings from true north.
+down; headings from true north. `MavlinkRows` collects recorded messages as arrays.
 
-What recorded MAVLink messages said, as arrays.
-
-MAVLink frames, in a stream of bytes and in telemetry logs.
-
-A frame begins with a marker and its length; behind a byte that only looks like a marker, the
-search goes on with the next byte, so that noise costs no good frame. In a telemetry log (``.tlog``) a time stands
-before each frame.
+`MavlinkFrames` finds frames in a stream of bytes and in telemetry logs. A frame begins with a marker and its length;
+after a byte that only looks like a marker, the search continues at the next byte, so that noise costs no good frame. In
+a telemetry log (``.tlog``) a time precedes each frame.
 """
 
 import math
@@ -66,7 +62,7 @@ class MavlinkReading(NamedTuple):
 
 
 def usec(message: Any) -> float:
-    """When a measurement was made [us]: since 1970 above `UNIX_USEC`, else since the sender's start; 0 = not said.
+    """When a measurement was made [us]: since 1970 above `UNIX_USEC`, else since the sender's start; 0 = not stated.
 
     What holds over an interval is of its middle.
     """
@@ -77,14 +73,14 @@ def usec(message: Any) -> float:
 
 
 def scaled_imu(message: Any) -> list[MavlinkReading]:
-    """Of RAW_IMU or SCALED_IMU, mg, mrad/s and mgauss; a sensor that is not there says zeros."""
+    """Of RAW_IMU or SCALED_IMU, mg, mrad/s and mgauss; zeros for a sensor that is not there."""
     acc, gyr, mag = (tuple(float(getattr(message, n)) for n in names) for names in (_ACC, _GYR, _MAG))
     found = [MavlinkReading("imu", (*(MILLI_G * a for a in acc), *(1e-3 * g for g in gyr)))] if any(acc) else []
     return found + ([MavlinkReading("mag", tuple(MICROTESLA["milligauss"] * m for m in mag))] if any(mag) else [])
 
 
 def highres_imu(message: Any) -> list[MavlinkReading]:
-    """Of HIGHRES_IMU, SI and gauss: what it says is new."""
+    """Of HIGHRES_IMU, SI and gauss: the fields that it marks as new."""
     found = []
     if message.fields_updated & 0x03F == 0x03F:
         found.append(MavlinkReading("imu", tuple(float(getattr(message, n)) for n in _ACC + _GYR)))
@@ -122,7 +118,7 @@ def velocity(message: Any) -> list[MavlinkReading]:
 
 
 def velocity_estimate(message: Any) -> list[MavlinkReading]:
-    """Of VISION_SPEED_ESTIMATE; along which axes, the message does not say."""
+    """Of VISION_SPEED_ESTIMATE, whose message does not state the axes."""
     return [MavlinkReading("dvl", (message.x, message.y, message.z, 1.0))]
 
 
@@ -160,7 +156,7 @@ Sender = tuple[int, int]  # system, component
 
 @dataclass(frozen=True)
 class MavlinkRows:
-    """What messages of one sender and name said of one sensor.
+    """The values of one sensor from messages of one sender and name.
 
     Attributes
     ----------
@@ -193,7 +189,7 @@ class MavlinkRows:
         return self.take(computed(lambda place: (place >= first) & (place < end), self.place))
 
     def interleaved(self, names: Sequence[str], other: "MavlinkRows") -> "MavlinkRows":
-        """Columns of one, and all of the other, in the order of messages; what a row does not say is NaN."""
+        """Columns of one, and all of the other, in the order of messages; values missing in a row are NaN."""
         order = np.argsort(np.concatenate([self.place, other.place]), kind="stable")
         own = {name: np.concatenate([self.columns[name], np.full(len(other), np.nan)]) for name in names}
         others = {name: np.concatenate([np.full(len(self), np.nan), v]) for name, v in other.columns.items()}
@@ -253,7 +249,7 @@ class Gatherer:
             rows.append(row)
 
     def rows(self) -> dict[tuple[Sender, str, str], MavlinkRows]:
-        """All that was taken: sender, name of the message and sensor -> Rows."""
+        """All rows taken: sender, name of the message and sensor -> Rows."""
         return {key: _rows(*key, flat) for key, flat in self._flat.items()}
 
 
@@ -282,7 +278,7 @@ def dialect() -> Any:
 
 
 def frame_length(data: Content | bytearray, start: int) -> int | None:
-    """Bytes of the frame that begins with the marker at ``start``; None where too few are there to tell."""
+    """Bytes of the frame that begins with the marker at ``start``; None where there are too few."""
     if len(data) < start + 3:
         return None
     payload, flags = data[start + 1], data[start + 2]
@@ -297,7 +293,7 @@ class MavlinkFrames:
     Parameters
     ----------
     mavlink : pymavlink's dialect
-    notify : takes warnings; "bad data" once per stretch of bytes that is no message
+    notify : takes warnings; "bad data" once per stretch of bytes between messages
     """
 
     def __init__(self, mavlink: Any, notify: Callable[[str, str], None]) -> None:

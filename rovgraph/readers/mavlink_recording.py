@@ -1,4 +1,4 @@
-"""MAVLink messages that somebody received and recorded, as a recording: of telemetry logs and of BlueOS."""
+"""Recorded MAVLink messages as a recording: of telemetry logs and of BlueOS."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -160,18 +160,18 @@ class _Vehicle:
             for place, name in enumerate(preferred_first(self._path, sensor, list(sources), self._choose)):
                 said = len(self.notes), len(self.warnings)
                 yield from make(sensor, sources[name])
-                if place:  # nothing is said of what may not be used
+                if place:  # unused ones get no warning
                     del self.notes[said[0] :], self.warnings[said[1] :]
 
     def _own(self, kind: str) -> dict[str, MavlinkRows]:
-        """What the autopilot says of a sensor, by the names of messages, those that `IMUS` knows in its order."""
+        """The autopilot's values of a sensor, by the names of messages, those in `IMUS` in its order."""
         found = {
             name: r for (sender, name, of), r in self._rows.items() if (sender, of) == (self.sender, kind) and len(r)
         }
         return dict(sorted(found.items(), key=lambda each: IMUS.index(each[0]) if each[0] in IMUS else -1))
 
     def _anyones(self, kind: str) -> dict[str, MavlinkRows]:
-        """What anyone says of a sensor, by the names of messages: of each the sender who says most."""
+        """All senders' values of a sensor, by the names of messages: for each the sender with most of them."""
         found: dict[str, MavlinkRows] = {}
         for (_, name, of), rows in sorted(self._rows.items(), key=lambda each: len(each[1])):
             if of == kind and len(rows):

@@ -1,6 +1,6 @@
-"""Recordings of one dive become one log: sensors selected, clocks joined, rows in the order of time.
+"""Merges recordings of one dive into one log: sensors selected, clocks joined, rows in the order of time.
 
-An account of what was made of files: what each held, where every column came from, and how clocks were joined.
+`account` lists the contents of each file, the origin of every column, and how clocks were joined.
 """
 
 import warnings as python_warnings
@@ -43,7 +43,7 @@ class Merged:
     selected, unused : what feeds the log, and what does not
     clocks : how the stamps were put on the log's clock
     unix : that is Unix time
-    settings : what the files know, dotted key -> (value, file)
+    settings : from the files, dotted key -> (value, file)
     warnings : what looks wrong, a sentence each
     tables : other tables of the files (name -> column -> ndarray, shape (n,)), their ``time`` by the log's clock [s].
         Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL
@@ -94,7 +94,7 @@ class Merged:
         )
 
     def nested_settings(self) -> dict[str, Any]:
-        """What the files know, nested as in YAML."""
+        """Settings from the files, nested as in YAML."""
         out: dict[str, Any] = {}
         for key, (value, _) in self.settings.items():
             *above, last = key.split(".")
@@ -117,7 +117,7 @@ def merge(
     ----------
     choose : sensor -> file, instance, message or topic that feeds it
     shift : sensor or file -> what is added to its stamps [s]
-    times : sensor or file, or `EVERY` -> `ARRIVAL`, where its stamps are to be those of the recorder
+    times : sensor or file, or `EVERY` -> `ARRIVAL`, where the recorder's stamps are used
 
     Raises
     ------
@@ -178,7 +178,7 @@ def _tables(
 
 
 def _stamped(recordings: Sequence[Recording], times: Mapping[str, str]) -> list[Recording]:
-    """Recordings of which some channels are stamped by whoever received them."""
+    """Recordings of which some channels are stamped by their receiver."""
     out, known, taken = [], {EVERY}, False
     for recording, name in zip(recordings, file_names(recordings), strict=True):
         of_file = times.keys() & {EVERY, name, *recording.names}
@@ -212,7 +212,7 @@ def _moved_as(time: Array, before: Channel, after: Channel) -> Array:
 
 
 def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
-    """Recordings whose stamps are in order, and all that is to be warned of."""
+    """Recordings whose stamps are in order, and all warnings."""
     out: list[Recording] = []
     said: list[str] = []
     for recording, name in zip(recordings, file_names(recordings), strict=True):
@@ -240,7 +240,7 @@ def _motion(channels: Sequence[Channel]) -> MotionSignals:
 def _settings(
     recordings: Sequence[Recording], selected: Sequence[Selected], clocks: Sequence[JoinedClock]
 ) -> dict[str, tuple[Any, str]]:
-    """What the files know of the instruments that were selected, and how certain the clocks are."""
+    """Settings from the files for the selected instruments, and how certain the clocks are."""
     feeds = {each.channel.sensor: each.file for each in selected}
     out: dict[str, tuple[Any, str]] = {}
     for k, (recording, name) in enumerate(zip(recordings, file_names(recordings), strict=True)):
@@ -253,7 +253,7 @@ def _settings(
     }
     reference = next((stamps[sensor] for sensor in BASES if sensor in stamps), stamps[selected[0].channel.sensor])
     for each in selected:
-        clock = stamps[each.channel.sensor]  # how late it is against the reference is all that an estimate knows of
+        clock = stamps[each.channel.sensor]  # an estimate sees only its lateness against the reference
         if each.channel.sensor in OFFSETS and clock is not reference and clock.sd > UNSURE_S:
             key = f"calibration.{each.channel.sensor}_time_offset"
             origin = f"clock {clock.name}: {clock.how}"
@@ -263,7 +263,7 @@ def _settings(
 
 
 def account(merged: Merged) -> dict[str, Any]:
-    """For JSON, in seconds, hertz and SI; what is not known is None."""
+    """For JSON, in seconds, hertz and SI; unknown values are None."""
     names = merged.names
     selected = {id(each.channel) for each in merged.selected}
     reasons = {id(each.channel): each.reason for each in merged.unused}
@@ -345,7 +345,7 @@ def timing(channel: Channel) -> dict[str, Any]:
 
 
 def notes(merged: Merged) -> list[str]:
-    """What a reader of the log should know, a sentence each."""
+    """Remarks for a reader of the log, a sentence each."""
     names, said = merged.names, []
     for each in merged.selected:
         frame = f", {each.channel.frame}" if each.channel.frame else ""

@@ -80,7 +80,7 @@ SOURCES = (
         )
     ),
 )
-FIXES = (  # latitude, longitude, sd, and flags of which one says that they are valid
+FIXES = (  # latitude, longitude, sd, and flags, of which one marks them as valid
     (*_field("8103", "lat", "long", "horzacc"), "flags x8103"),
     ("latitude", "longitude", "horizontalaccuracy", ""),
 )
@@ -99,7 +99,7 @@ SEPARATORS = {b"comma": ",", b"semicolon": ";", b"tab": "\t"}
 DECIMALS = {b"period": ".", b"point": ".", b"comma": ","}
 DATES = ("%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S.%f %p", "%m/%d/%Y %I:%M:%S %p")
 GPS_SD_S, COMPUTER_SD_S = 0.01, 1.0
-ZONE_SD_S = 6 * 3600.0  # of a computer's calendar, whose time zone nobody states
+ZONE_SD_S = 6 * 3600.0  # of a computer's calendar without a stated time zone
 
 
 class MicroStrain:
@@ -156,7 +156,7 @@ def _plain(name: str) -> tuple[str, str]:
 
 
 def _is_theirs(names: Sequence[str]) -> bool:
-    """Whether names are written as nobody else does: with a descriptor, or as MSCL does, ``scaledAccelX``."""
+    """Whether names are written as only MicroStrain does: with a descriptor, or as MSCL does, ``scaledAccelX``."""
     return any(
         DESCRIPTOR.match(name) or (_plain(name)[0] in OWN and name.rpartition(":")[2][:1].islower()) for name in names
     )
@@ -175,7 +175,7 @@ def _of_one_device(names: Sequence[str]) -> Callable[[str], tuple[str, str]]:
 
 
 def _fixes(table: TextTable, time: Array) -> list[InertialMeasurement]:
-    """Positions of the instrument's GNSS, where it says that they are valid."""
+    """Positions of the instrument's GNSS, where it marks them as valid."""
     for *names, flags in FIXES:
         if table.holds(*names[:2]):
             sd = table[names[2]] if names[2] in table else np.full(len(time), np.nan)

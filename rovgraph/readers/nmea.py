@@ -1,14 +1,14 @@
-"""Files of NMEA 0183 sentences: fixes and headings of a ship or of the vehicle.
+"""Files of NMEA 0183 sentences: fixes and headings of a ship or of the vehicle, and acoustic fixes from a ship.
 
 Most headings have no time of their own: they are put between the sentences around them that have one, by their place in
 the file.
 
-Fixes of a vehicle from a ship's acoustic positioning: PSIMSSB beside the ship's own fixes and heading.
+Acoustic positioning gives fixes of a vehicle by PSIMSSB beside the ship's own fixes and heading.
 
 ``$PSIMSSB,hhmmss.ss,transponder,status,error,coordinates,orientation,filter,x,y,depth,accuracy,...``: Cartesian
 coordinates (C) [m] along starboard and bow (H), north and east (N) or east and north (E). Its clock is UTC or local
-time, so that whole half hours of it do not count. Status A does not mean a reply: an error code does not (NRy: none),
-and the position is then a zero or an extrapolated one, as it is where the filter says P for predicted. M is measured, F
+time, so that whole half hours of it do not count. Status A may stand without a reply: an error code (NRy) means that
+there was none, and the position is then zero or extrapolated, as it is with filter P (predicted). M is measured, F
 filtered, which follows turns late. ``$PSIMSNS,hhmmss.ss,transponder,transceiver,transducer,roll,pitch,heave,heading,``
 has the ship's attitude at a ping. Source: Kongsberg Simrad, HiPAP/HPR 400 NMEA 0183 sentences, 850-160045.
 """
@@ -80,7 +80,7 @@ def relative_position(text: str, last: float | None) -> tuple[str, tuple[float, 
     Parameters
     ----------
     text : of the sentence, whose checksum is right
-    last : time of that sentence, None = there is none [s]
+    last : time of that sentence, None = without one [s]
 
     Raises
     ------
@@ -218,7 +218,7 @@ def _ship(fixes: Channel, heading: Channel | None) -> Ship:
 
 
 class _Sentences:
-    """Takes sentences one by one; rows know their place in the file.
+    """Takes sentences one by one; rows keep their place in the file.
 
     Attributes
     ----------
@@ -416,7 +416,7 @@ class _Sentences:
         return made
 
     def _ships_heading(self, place: Array, time: Array) -> Channel | None:
-        """Of the acoustic system, where no gyrocompass speaks for itself."""
+        """Of the acoustic system, where no gyrocompass has sentences of its own."""
         rows = next((rows for (of, _), rows in self._rows.items() if of == SHIPS_ATTITUDE), None)
         if rows is None:
             return None
@@ -424,7 +424,7 @@ class _Sentences:
         return Channel("ahrs", {"time": np.interp(at, place, time), "ahrs_yaw": heading}, SHIPS_ATTITUDE)
 
     def _look(self, channels: list[Channel], said: list[str]) -> tuple[dict[str, Any], list[str]]:
-        """Settings that the file knows, and what may be wrong beside what is ``said``."""
+        """Settings from the file, and possible errors beside ``said``."""
         warnings, environment = [*said], {}
         talkers = [channel.source for channel in channels if channel.sensor == "fix"]
         if talkers:

@@ -79,7 +79,7 @@ class SentenceTimes:
     Attributes
     ----------
     last : of the last sentence with a time, None = none yet
-    dated : whether a sentence has told the date
+    dated : whether a sentence had the date
     """
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ class SentenceTimes:
 
 
 def heading_of(sentence: Any) -> tuple[float, bool] | None:
-    """Heading [deg], and whether it is relative to true north; None where there is none."""
+    """Heading [deg], and whether it is relative to true north; None without a heading."""
     heading = number(sentence.heading)
     if heading is None or not 0.0 <= heading <= 360.0:
         return None
@@ -126,7 +126,7 @@ def heading_of(sentence: Any) -> tuple[float, bool] | None:
 def attitude_of(text: str) -> tuple[clock_time | None, float | None, float | None, float | None] | None:
     """Of a sentence of `ATTITUDES` or `TILT`: its time of day, heading, pitch and roll [deg]; None where it has none.
 
-    Pitch is positive with the bow up, roll with starboard down. The True North's may be set to mils: then it says so
+    Pitch is positive with the bow up, roll with starboard down. The True North's may be set to mils, as it then states
     nowhere.
 
     Parameters
@@ -159,7 +159,7 @@ def attitude_of(text: str) -> tuple[clock_time | None, float | None, float | Non
 
 
 def day_time(cell: str) -> clock_time | None:
-    """The time of day of ``hhmmss.sss``; None where it is none."""
+    """The time of day of ``hhmmss.sss``; None if it is invalid."""
     if len(cell) < 6 or not cell[:6].isdigit() or number(cell) is None:
         return None
     try:
@@ -170,7 +170,7 @@ def day_time(cell: str) -> clock_time | None:
 
 
 def fix_of(sentence: Any) -> tuple[float, float, float] | None:
-    """Latitude, longitude [deg] and sd [m] of a fix; None where there is none.
+    """Latitude, longitude [deg] and sd [m]; None without a fix.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def place(sentence: Any) -> tuple[float, float]:
 
     Raises
     ------
-    Refused : they are none
+    Refused : they are invalid
     """
     try:
         lat, lon = float(sentence.latitude), float(sentence.longitude)
@@ -201,7 +201,7 @@ def place(sentence: Any) -> tuple[float, float]:
 
 
 def fix_sd(sentence: Any) -> float | None:
-    """Of a GGA fix, north and east [m]: NaN where it does not tell, None where there is no fix."""
+    """Of a GGA fix, north and east [m]: NaN where it is not stated, None without a fix."""
     quality, hdop = sentence.gps_qual, number(sentence.horizontal_dil)
     if quality not in RANGE_SD_M:
         return None

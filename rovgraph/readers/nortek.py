@@ -1,8 +1,6 @@
-"""Bottom and water tracks of Nortek's DVLs, as channels of a log.
+"""Nortek's binary records, found by their two checksums, and bottom and water tracks as channels of a log.
 
 Velocities are those of the instrument, along its X, Y and Z: forward, starboard and down as it is drawn.
-
-Records of Nortek's binary files and streams, found by their two checksums.
 
 Source: Nortek AS, Signature Integrator's Guide N3015-007, DVL Integrator's Guide N3015-009, Nucleus Integrator's Guide
 N3015-046. dolfyn 1.3 does not import beside NumPy 2 and skips the records of DVLs; nucleus-driver makes a dictionary of
@@ -22,7 +20,7 @@ from rovgraph.geometry import Array
 from rovgraph.readers.recording import Channel
 
 FRAME = "X, Y, Z of the instrument: forward, starboard, down as it is drawn"
-LONGEST_DELAY_S = 5.0  # from a stamp to the echo; more is none
+LONGEST_DELAY_S = 5.0  # from a stamp to the echo; more is invalid
 BAR = 1e5  # [Pa]
 
 
@@ -85,7 +83,7 @@ def water_channels(track: NortekTrack, name: str, clock: str) -> Iterator[Channe
 
 
 def beam_table(track: NortekTrack) -> dict[str, Array]:
-    """What each beam measured."""
+    """Measurements of each beam."""
     of_beams = {"velocity": track.beams, "distance": track.distance, "fom": track.merit}
     count = track.beams.shape[1]
     columns = {f"{name}_{k + 1}": values[:, k] for name, values in of_beams.items() for k in range(count)}

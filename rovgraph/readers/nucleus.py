@@ -34,7 +34,7 @@ from rovgraph.readers.records import gathered, layout
 IMU, MAGNETOMETER, BOTTOM, WATER, AHRS, INS = 0x82, 0x87, 0xB4, 0xBE, 0xD2, 0xDC
 POSIX, BOOT = "Nucleus's Unix time", "Nucleus's time since its start"
 GAUSS = 100.0  # [uT]
-KINDS = IMU, MAGNETOMETER, BOTTOM, WATER, AHRS  # that tell of a sensor
+KINDS = IMU, MAGNETOMETER, BOTTOM, WATER, AHRS  # with sensor data
 OTHERS = {0xAA: "altimeter", 0x8B: "field calibration", 0xA0: "text", 0xC0: "current profile", 0xC1: "current profile",
           0x96: "fast pressure", INS: "navigation solution, computed by the instrument"}  # fmt: skip
 COMMON = layout(
@@ -125,7 +125,7 @@ def said_of(content: bytes | mmap.mmap, found: Records, kind: int) -> NucleusRec
 
 
 def track_of(said: NucleusRecords) -> NortekTrack:
-    """A track; the status says what of it is valid."""
+    """A track; its status marks the valid values."""
     values, status = said.values, said.values["status"]
     return NortekTrack(
         time=said.time,

@@ -42,7 +42,7 @@ class OwnLog:
     def read(self, path: Path, options: ReadingOptions) -> Recording:
         """Every sensor of the log, its stamps one clock."""
         with collected_warnings() as texts, python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore")  # said by whoever joins recordings, with the name of the file
+            python_warnings.simplefilter("ignore")  # the join repeats them with the name of the file
             table = read_table(path)
             cells, names = read_columns(table, options.table)
             beams = beams_beside(path)

@@ -4,13 +4,12 @@ Bottom track is the velocity of the bottom against the instrument; a log has the
 forward (beam 3, or the ship's bow), starboard, down, whatever the file's are (`rovgraph.readers.trdi`).
 
 WinRiver and VmDas write a receiver's fixes beside the pings, with their time of day (UTC) and how long before the ping
-they came. So the file tells how far the instrument's clock is off. Sources: Teledyne RD Instruments, WinRiver II User's
+they came, which gives the error of the instrument's clock. Sources: Teledyne RD Instruments, WinRiver II User's
 Guide, General NMEA data; VmDas User's Guide, navigation data.
 
-Ensembles of Teledyne PD0 files, found by their checksums, and their records as structured arrays.
-
-Source: Teledyne RD Instruments, Workhorse Commands and Output Data Format, P/N 957-6156-00, chapter 8. dolfyn 1.3 does
-not import beside NumPy 2, and keeps one coordinate system for a file.
+Ensembles are found by their checksums, and their records become structured arrays. Source: Teledyne RD Instruments,
+Workhorse Commands and Output Data Format, P/N 957-6156-00, chapter 8. dolfyn 1.3 does not import beside NumPy 2, and
+keeps one coordinate system for a file.
 """
 
 import mmap
@@ -90,7 +89,7 @@ class Ensembles:
     at : kind -> first byte of its record in each ensemble, -1 = it has none
     length : kind -> bytes of it
     several : kind -> number of the ensemble, first byte and bytes of each record, one after the other
-    others : kind -> how many records there are of those that `LAYOUTS` does not know
+    others : kind -> number of records that are not in `LAYOUTS`
     failed : ensembles with a wrong checksum
     skipped : bytes that belong to no whole ensemble
     """
@@ -180,14 +179,14 @@ def _keep(found: Ensembles, table: list[tuple[int, int]], end: int) -> None:
     found.others.update(kind for _, kind in table if kind not in LAYOUTS and kind not in SEVERAL)
 
 
-ZONE_SD_S = 6 * 3600.0  # of a clock whose time zone nobody states
+ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 BAD = -32768
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
 SEMICIRCLE = 180.0 / 2**31  # [deg]
 DAY_S = 86_400.0
 UTC = "UTC of the receiver"
-RECORDED_SD_S = 0.05  # of when a sentence came, which the recording computer tells
+RECORDED_SD_S = 0.05  # of the recording computer's arrival time of a sentence
 POLE_DEG = 89.5
 FASTEST = 60.0  # median speed between positions, that no vehicle has and wrong numbers easily have [m/s]
 DEG_M = 111_195.0
@@ -335,7 +334,7 @@ def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) ->
 
 
 def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Told | None:
-    """The same of sentences as they came, which tell no delay."""
+    """The same of sentences as they came, without a stated delay."""
     rows, ensemble = found.records_of(content, GGA, TEXT)
     cells = [[*text.decode("ascii", "replace").split(","), *[""] * 9] for text in rows["text"]]
     if not cells:
@@ -382,7 +381,7 @@ def _headings(content: bytes | mmap.mmap, found: Ensembles, pinged: Array) -> tu
 
 
 def _of_day(clocks: list[str], about: Array) -> Array:
-    """Unix time of times of day as ``hhmmss.ss``, on the day nearest to what the instrument's clock says."""
+    """Unix time of times of day as ``hhmmss.ss``, on the day nearest to the instrument's clock."""
     days = [day_time(clock) for clock in clocks]
     seconds = [
         np.nan if t is None else 3600.0 * t.hour + 60.0 * t.minute + t.second + 1e-6 * t.microsecond for t in days
@@ -392,7 +391,7 @@ def _of_day(clocks: list[str], about: Array) -> Array:
 
 
 def _degrees(cell: str, digits: int) -> float:
-    """Of degrees and minutes as a sentence has them; NaN for what is none."""
+    """Of degrees and minutes as a sentence has them; NaN for invalid ones."""
     degrees, minutes = number(cell[:digits]), number(cell[digits:])
     return np.nan if degrees is None or minutes is None else degrees + minutes / 60.0
 
@@ -429,7 +428,7 @@ def _with(made: Recording, receiver: _Receiver) -> Recording:
 
 
 def decoded(content: bytes | mmap.mmap, found: Ensembles) -> Pings:
-    """What the ensembles of a file, or of a part of one, say."""
+    """The values of the ensembles of a file, or of a part of one."""
     fixed, _ = found.records(content, FIXED)
     variable, _ = found.records(content, VARIABLE)
     bottom, tracked = found.records(content, BOTTOM)
@@ -471,7 +470,7 @@ def _attitude(fixed: NDArray[np.void], system: NDArray[np.integer], rpy: Array) 
     """How the velocities of ensembles came to their axes.
 
     Roll and pitch in ship axes that no sensor of its own measures were written in by the vehicle afterwards, as a REMUS
-    does, and are not in the velocities: the depth in its files changes as its pitch says, not as its vertical velocity.
+    does, and are not in the velocities: the depth in its files changes with its pitch, not with its vertical velocity.
     """
     own = (fixed["source"] & LEVEL_SENSORS) == LEVEL_SENSORS
     angle = np.where(fixed["beam_angle"] <= 45, fixed["beam_angle"], 0).astype(float)
@@ -493,7 +492,7 @@ def _velocities(bottom: NDArray[np.void], name: str) -> Array:
 
 
 def _time(date: NDArray[np.uint8], century: NDArray[np.uint8]) -> Array:
-    """Seconds since 1970 of calendar dates, of which years may have two digits; NaN for what is none."""
+    """Seconds since 1970 of calendar dates, of which years may have two digits; NaN for invalid ones."""
     year, month, day, hour, minute, second, hundredths = date.astype(np.int64).T
     full = np.where((century == 19) | (century == 20), 100 * century.astype(np.int64), 2000) + year
     whole = unix_of_calendar(full, month, day, hour, minute, second)

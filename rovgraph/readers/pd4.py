@@ -113,7 +113,7 @@ class FrameCutter:
 
 
 def decoded(frames: NDArray[np.uint8]) -> tuple[Pings, dict[str, int]]:
-    """What frames say, and how many velocities have axes that nothing turns back, by the reason.
+    """The values of frames, and how many velocities have axes that cannot be turned back, by the reason.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _velocities(raw: NDArray[np.int16]) -> Array:
 
 
 def _time(clock: NDArray[np.uint8]) -> Array:
-    """Seconds since the midnight before the first ping; NaN where the clock cannot say so."""
+    """Seconds since the midnight before the first ping; NaN where the clock cannot give them."""
     hour, minute, second, hundredths = clock.astype(float).T
     time = 3600.0 * hour + 60.0 * minute + second + 0.01 * hundredths
     time[(hour > 23) | (minute > 59) | (second > 59) | (hundredths > 99)] = np.nan

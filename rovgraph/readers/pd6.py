@@ -22,7 +22,7 @@ TAGS = ("SA", "TS", "WI", "WS", "WE", "WD", "BI", "BS", "BE", "BD")
 SENTENCE = re.compile(rb"^:(" + "|".join(TAGS).encode() + rb"),([-+0-9., AV]*)$")
 FEW = 2  # sentences that make a file of them
 CLOCK = "DVL's clock"
-ZONE_SD_S = 6 * 3600.0  # of a clock whose time zone nobody states
+ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 LONGEST = 200  # bytes of a sentence
 PREFERRED = {"B": ("BI", "BS", "BE"), "W": ("WI", "WS", "WE")}  # instrument's axes, the ship's, Earth's
 COLUMNS = {"B": ("dvl_vx", "dvl_vy", "dvl_vz"), "W": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz")}
@@ -45,7 +45,7 @@ class Pd6Sentences:
         self._best: dict[str, str] = {}
 
     def columns(self, line: bytes) -> Values | None:
-        """What a sentence says of sensors, in SI; None where it is none.
+        """The sensor values of a sentence, in SI; None for other sentences.
 
         A ping has the same velocity in several axes; only the best ones that were heard are taken.
         """

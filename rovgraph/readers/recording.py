@@ -1,12 +1,11 @@
-"""What one native file holds, before clocks are joined: channels of a log, and an account of the rest.
+"""The contents of one native file, before clocks are joined: channels of a log, and an account of the rest.
 
 A reader (`rovgraph.readers.formats.Format`) turns a file into a `Recording`. Times stay on the file's own
-clocks, units become SI and radians, vectors stay in the instrument's axes: what these are is said in words
-(`Channel.frame`) and as a piece of configuration (`Recording.settings`), never mended by a sign in code.
+clocks, units become SI and radians, vectors stay in the instrument's axes: these are stated in words
+(`Channel.frame`) and as a piece of configuration (`Recording.settings`), never changed by a sign in code.
 
-Whether an inertial unit was recorded often enough.
-
-Several sources of one sensor's measurements: which comes first.
+`too_slow` tells whether an inertial unit was recorded often enough; `preferred_first` orders several sources of one
+sensor's measurements.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,7 +48,7 @@ class Zero:
     Attributes
     ----------
     depth : of water that weighs as much as the pressure that was taken off [m]
-    said : the sentence of `Recording.warnings` that tells it
+    said : its sentence in `Recording.warnings`
     measured : False = the standard atmosphere, as nothing was measured near the surface
     """
 
@@ -147,14 +146,14 @@ class Recording:
     channels : what goes into the log; several of one sensor are alternatives, the preferred one first
     clocks : name -> Clock, of every channel's clock
     left : what the file holds beside that
-    settings : configuration that the file knows (mountings, lever arms, declination, ...), nested as in YAML
+    settings : configuration from the file (mountings, lever arms, declination, ...), nested as in YAML
     notes : assumptions and what was found on the way, a sentence each
     warnings : what looks wrong, a sentence each
     tables : other tables that are worth keeping (name -> column -> ndarray, shape (n,)), with a column ``time`` [s] by
-        the clock of the DVL's channels, or of the first channel where there is none. ``dvl_beams`` has what each beam
+        the clock of the DVL's channels, or of the first channel without one. ``dvl_beams`` has what each beam
         of the DVL measured, its columns as `rovgraph.log.beams` names them
     pieces : the files that it was joined of, in the order of time; () = it is one file
-    assumed : section of ``settings`` that is not known but assumed -> the sentence of ``warnings`` that tells it
+    assumed : section of ``settings`` that is assumed -> its sentence in ``warnings``
     """
 
     path: str

@@ -1,6 +1,6 @@
-"""What stands in a line of text: JSON objects and their numbers, and lines that are not taken.
+"""Lines of text and binary records: JSON objects and their numbers, refused lines, structured arrays.
 
-Records of one kind that lie anywhere in a binary file, as one structured array.
+Binary records of one kind may lie anywhere in a file; they become one structured array.
 """
 
 import json
@@ -57,7 +57,7 @@ def json_number(name: str, value: object, scale: float = 1.0) -> float:
 
     Raises
     ------
-    Refused : it is none, or not finite
+    Refused : not a number, or not finite
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         kind = {bool: "boolean", str: "string", type(None): "null"}.get(type(value), "nested value")
@@ -94,7 +94,7 @@ def gathered(
 
     Parameters
     ----------
-    at, length : first byte of each, -1 = there is none, and its bytes
+    at, length : first byte of each, -1 = without one, and its bytes
     least : bytes of a record that is worth reading
     """
     raw = np.frombuffer(content, np.uint8)

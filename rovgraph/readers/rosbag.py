@@ -1,11 +1,10 @@
-"""ROS 1 bags and ROS 2 bags (SQLite, MCAP), without ROS: what sensors say in them.
+"""ROS 1 bags and ROS 2 bags (SQLite, MCAP) as recordings, without ROS.
 
 A message is decoded by the definition that its bag carries, else by that of rosbags, else by one of
-`rosbag_messages.DEFINITIONS`. Topics that tell of no sensor, images among them, are counted and never decoded.
+`rosbag_messages.DEFINITIONS`. Topics without sensor data, images among them, are counted and never decoded.
 
-Mountings and lever arms from ``/tf_static`` (REP 103: x forward, y left, z up; REP 105: base_link).
-
-From what a bag's topics say to a recording: which topic feeds a sensor, by which clock, in which axes.
+`recording` chooses which topic feeds a sensor, by which clock, in which axes. Mountings and lever arms come from
+``/tf_static`` (REP 103: x forward, y left, z up; REP 105: base_link).
 """
 
 import struct
@@ -91,21 +90,21 @@ def _rounded(values: Array, digits: int) -> list[float]:
 
 HEADERS, RECORDER = "headers of messages", "recorder"
 LATENCY_SD_S = 0.05
-SOME = 10_000  # messages that something is told by
+SOME = 10_000  # messages enough for a judgement
 SEA = 1025.0  # density of water [kg/m3]
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @dataclass
 class Topic:
-    """What a topic said.
+    """The messages of a topic.
 
     Attributes
     ----------
     name, type : of the topic
     frame : that its messages name
     rows : sensor -> stamp [s], arrival [s] and `COLUMNS`, row after row
-    latencies : messages whose stamp is of arrival, less the time that they say they took
+    latencies : messages whose stamp is of arrival, less the delay that they state
     clock : that its stamps share with other topics ("" = that of headers)
     declination_deg : that an instrument has added to its heading
     """
@@ -151,7 +150,7 @@ def recording(
 
 
 class _Made:
-    """Channels, and what is said of them."""
+    """Channels, and their warnings."""
 
     def __init__(self, path: Path, frames: FrameTree, left: list[Left], options: ReadingOptions) -> None:
         self.left = left
@@ -165,7 +164,7 @@ class _Made:
         self._zeros: dict[str, Zero] = {}  # by topic
 
     def of(self, sensor: str, topics: Mapping[str, Topic]) -> Iterator[Channel]:
-        """All topics that tell of a sensor, the preferred one first."""
+        """All topics with sensor data, the preferred one first."""
         chosen = self._choose.get(sensor, "")
         telling = {}
         for topic in topics.values():
@@ -180,7 +179,7 @@ class _Made:
         for place, name in enumerate(preferred_first(self._path, sensor, order, self._choose)):
             said = len(self.notes), len(self.warnings)
             channel = self._channel(sensor, telling[name], place == 0)
-            if place:  # nothing is said of what may not be used
+            if place:  # unused ones get no warning
                 del self.notes[said[0] :], self.warnings[said[1] :]
             yield channel
 
@@ -202,7 +201,7 @@ class _Made:
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
-            told = topic.clock == NUCLEUS  # others tell pressure
+            told = topic.clock == NUCLEUS  # others have pressure
             return {"depth": values[:, 0] if told else self._depth(topic, values[:, 0])}
         if sensor == "ahrs":
             return self._attitude(topic, values)
@@ -259,7 +258,7 @@ class _Made:
         return depth(pressure, surface, SEA)
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
-        """The IMU's axes relative to NED; gravity tells whether the messages' world has z up or down."""
+        """The IMU's axes relative to NED; gravity shows whether the messages' world has z up or down."""
         up = -1.0
         if topic.clock == NUCLEUS:
             self.notes.append(f"{topic.name}: heading less the declination that the instrument has added")
@@ -451,7 +450,7 @@ class _Bag:
             self._left[name, "damaged messages"] += 1
 
     def left(self) -> list[Left]:
-        """What was not taken."""
+        """Topics that were not taken."""
         return [Left(name, count, why) for (name, why), count in sorted(self._left.items()) if count]
 
 

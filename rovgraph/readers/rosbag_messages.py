@@ -1,13 +1,12 @@
-"""ROS messages that tell of a sensor: from a message to the columns of a log.
+"""ROS messages of sensors as columns of a log.
 
-Values stay in the axes of the message's frame; what a covariance of -1 means is said by each type's own definition.
+Values stay in the axes of the message's frame; each type's own definition states what a covariance of -1 means.
 Units of ROS are SI (REP 103): https://www.ros.org/reps/rep-0103.html.
 
-ROS messages of a Nortek Nucleus: its packets, as the maker's driver passes them on unchanged.
-
-They have no header: ``timestamp`` and ``microseconds`` are the instrument's, ``system_timestamp`` the driver's. Axes
-and units are those of `rovgraph.readers.nucleus`. Source: github.com/NortekSupport/nucleus_driver,
-ros2/src/interfaces/msg; the package is called ``interfaces``, so messages of others may have its types.
+Messages of a Nortek Nucleus are its packets, which the maker's driver passes on unchanged. They have no header:
+``timestamp`` and ``microseconds`` are the instrument's, ``system_timestamp`` the driver's. Axes and units are those of
+`rovgraph.readers.nucleus`. Source: github.com/NortekSupport/nucleus_driver, ros2/src/interfaces/msg; the package is
+called ``interfaces``, so messages of others may have its types.
 """
 
 import math
@@ -36,7 +35,7 @@ LONGEST_LATENCY_S = 5.0
 
 
 class RosReading(NamedTuple):
-    """What a message says of a sensor.
+    """The values of a sensor in a message.
 
     Attributes
     ----------
@@ -128,7 +127,7 @@ def _twist(message: Any) -> Iterator[RosReading]:
 
 
 def _sd(covariance: Any, size: int) -> float:
-    """Per axis [m/s]; NaN where the covariance does not tell."""
+    """Per axis [m/s]; NaN where the covariance is not stated."""
     if len(covariance) != size * size:
         return math.nan
     variances = [float(covariance[k * (size + 1)]) for k in range(3)]
@@ -155,11 +154,11 @@ READERS: dict[str, Callable[[Any], Iterator[RosReading]]] = {
 GENERAL = ("geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")  # velocities of anything
 # z down, by definition; the last are those of a Nucleus
 DOWN = ("dvl_msgs/", "waterlinked_a50_ros_driver/", "marine_acoustic_msgs/", "acoustic_msgs/", "interfaces/")
-LATER = ("dvl_msgs/msg/DVL",)  # their header is of arrival, and they say how long the report took
+LATER = ("dvl_msgs/msg/DVL",)  # their header is of arrival, and they state the delay of the report
 
 
 def latency(message: Any) -> float:
-    """From validity to transmission [s] by the DVL's clock; 0 where it is not said, or the header is of validity."""
+    """From validity to transmission [s] by the DVL's clock; 0 where it is not stated, or the header is of validity."""
     took = 1e-6 * (message.time_of_transmission - message.time_of_validity)
     if message.time_of_validity <= 0 or not 0.0 <= took < LONGEST_LATENCY_S:
         return 0.0
@@ -210,7 +209,7 @@ def stamp(message: Any) -> float:
 
 
 def declination_deg(message: Any) -> float:
-    """What the instrument has added to its heading; 0 where it does not say."""
+    """The angle that the instrument has added to its heading; 0 where it is not stated."""
     declination = float(getattr(message, "declination", 0.0))
     return declination if math.isfinite(declination) else 0.0
 

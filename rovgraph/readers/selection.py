@@ -1,8 +1,8 @@
-"""Which files are pieces of one source, and which channel feeds each sensor of a log, where several could.
+"""Joins the pieces of one source, and selects the channel that feeds each sensor of a log, where several could.
 
 Two files are pieces of one source where format, sensors and columns agree, and their spans overlap by less than a tenth
 of the shorter: split bags, hourly files, logs that are cut at midnight. They become one recording in the order of time,
-whatever the order in which they were given; what they share is taken once, and what is missing between them is a gap.
+whatever the order in which they were given; an overlap is taken once, and time missing between them is a gap.
 """
 
 import re
@@ -95,7 +95,7 @@ def select(recordings: Sequence[Recording], choose: Mapping[str, str]) -> tuple[
 def require_used(
     recordings: Sequence[Recording], selected: Sequence[Selected], unused: Sequence[Unused], choose: Mapping[str, str]
 ) -> list[str]:
-    """What to warn of where two files have a sensor at the same time.
+    """Warnings where two files have a sensor at the same time.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def require_used(
 
 
 def _span(recording: Recording, channel: Channel) -> tuple[float, float, str] | None:
-    """First and last stamp, and by which time: `UNIX`, or that of a clock whose name says no more [s]."""
+    """First and last stamp, and by which time: `UNIX`, or that of an unknown clock [s]."""
     offset, time = recording.unix_offset(channel.clock), channel.columns["time"]
     if not len(time):
         return None
@@ -171,7 +171,7 @@ class _File:
     shift: float
 
     def added(self, clock: str, first: "_File") -> float | None:
-        """What makes stamps of a clock those of the same clock in another file [s]; None = they are not to be compared.
+        """Offset of a clock against the same clock in another file [s]; None = they are not to be compared.
 
         Offsets from Unix time that differ little were found twice of one clock, whose stamps are more exact.
         """
@@ -259,7 +259,7 @@ def why_apart(first: _File, last: _File, later: _File) -> str:
 
 
 def _once(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
-    """Recordings without those that repeat another one, and what to say of it."""
+    """Recordings without those that repeat another one, and warnings of these."""
     kept: list[Recording] = []
     said = []
     for each in recordings:

@@ -1,10 +1,8 @@
-"""Stamps of a channel that are put in order, by `rovgraph.log.stamps` and by the arrivals that a recorder kept.
+"""Puts the stamps of a channel in order, by `rovgraph.log.stamps` and by the arrivals that a recorder kept.
 
-The clock of whoever receives an autopilot's messages, by the autopilot's own.
-
-A vehicle's companion has no clock that runs while it is off, so its clock jumps once it learns the time; a link
-stalls, and then delivers what it held. The least delay (received - boot time) tells them apart: a stall leaves it as
-it was.
+`receiver_clock` corrects the clock of the receiver of an autopilot's messages by the autopilot's own. A vehicle's
+companion has no clock that runs while it is off, so its clock jumps once it receives the time; a link stalls, and then
+delivers the delayed messages. The least delay (received - boot time) distinguishes them: a stall does not change it.
 """
 
 import sys
@@ -25,7 +23,7 @@ from rovgraph.readers.recording import Channel
 RESET_S = 1.0  # boot time that goes back further is another boot
 STEP_S = 1.0  # delays of successive messages that differ by more: a stall, or a clock that was set
 SAME_S = 0.5  # least delays that differ by less are of one clock
-FEW = 20  # messages that are too few to tell
+FEW = 20  # messages, too few for a judgement
 
 
 @dataclass(frozen=True)
@@ -99,8 +97,8 @@ def longest_boot(place: NDArray[np.integer[Any]], boot: Array) -> tuple[int, int
 
 SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
 APART_S = 1.0  # between stamp and arrival; more is another clock
-SOME = 10_000  # rows that something is told by
-WENT_BY_S = 2.0  # that shows whether stamps go on
+SOME = 10_000  # rows enough for a judgement
+WENT_BY_S = 2.0  # that shows whether stamps advance
 STANDS = 0.1  # of the time that went by, over which stamps that stand still reach
 
 
@@ -177,14 +175,14 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
 
 
 def by_arrival(channel: Channel) -> Channel:
-    """A channel, whose arrivals are known, that is stamped by whoever received it."""
+    """A channel, whose arrivals are known, that is stamped by its receiver."""
     assert channel.received is not None
     columns = {**channel.columns, "time": channel.received}
     return replace(channel, columns=columns, clock=channel.receiver)
 
 
 def by_arrivals(stamp: Array, received: Array) -> tuple[Array | None, list[str]]:
-    """Stamps of a message's sender as whoever received them shows them to be.
+    """Stamps of a message's sender, corrected by its receiver's.
 
     Parameters
     ----------
@@ -206,12 +204,12 @@ def by_arrivals(stamp: Array, received: Array) -> tuple[Array | None, list[str]]
     out[rows] = clock.corrected(np.arange(len(rows)), out[rows])
     steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "an amount that too few messages show"
     apart = received[rows] - out[rows]
-    out[rows[np.abs(apart - np.median(apart)) > APART_S]] = np.nan  # too few to tell how their clock was set
+    out[rows[np.abs(apart - np.median(apart)) > APART_S]] = np.nan  # too few to find how their clock was set
     return out, [f"its clock was set by {steps}; earlier stamps are moved to it"]
 
 
 def _tells_nothing(stamp: Array, received: Array) -> str:
-    """What is wrong with stamps that tell nothing, as arrivals show; "" where they tell something."""
+    """What is wrong with useless stamps, by the arrivals; "" for useful ones."""
     stamp, received = (every(np.asarray(values), max(len(stamp) // SOME, 1)) for values in (stamp, received))
     known = np.isfinite(stamp) & (stamp != 0.0)
     if known.mean() <= 0.5:

@@ -1,4 +1,4 @@
-"""MAVLink telemetry logs (``.tlog``): what a ground station has received."""
+"""MAVLink telemetry logs (``.tlog``), which a ground station records."""
 
 import mmap
 from pathlib import Path
@@ -47,7 +47,7 @@ class TelemetryLog:
 
 
 def _take(gatherer: Gatherer, mavlink: Any, parser: Any, data: bytes, received: float) -> None:
-    """Count a frame, and take it if it tells of a sensor; only then is its checksum looked at."""
+    """Count a frame, and take it if it has sensor data; only then is its checksum tested."""
     if len(data) < 8 or frame_length(data, 0) != len(data):
         gatherer.unreadable["bytes that are no message"] += 1
         return

@@ -1,12 +1,9 @@
-"""Pings of Teledyne's Doppler instruments as channels of a log, whatever they were written as.
+"""Pings of Teledyne's Doppler instruments, from any of their formats and coordinate systems, as channels of a log.
 
-A log has the velocity of the instrument, along axes forward (beam 3, or the ship's bow), starboard, down.
-
-Velocities of Teledyne's Doppler instruments, from any of their coordinate systems to forward, starboard, down.
-
-An instrument has X from beam 1 to beam 2, Y from beam 4 to beam 3 and Z away from the bottom it looks at; a ship has X
-to starboard, Y forward and Z up the mast; Earth has east, north, up. Source: Teledyne RD Instruments, ADCP Coordinate
-Transformation, P/N 951-6079-00.
+A log has the velocity of the instrument, along axes forward (beam 3, or the ship's bow), starboard, down. In the
+instrument's system X is from beam 1 to beam 2, Y from beam 4 to beam 3 and Z away from the bottom it looks at; in the
+ship's X is to starboard, Y forward and Z up the mast; Earth has east, north, up. Source: Teledyne RD Instruments, ADCP
+Coordinate Transformation, P/N 951-6079-00.
 """
 
 from collections.abc import Iterator
@@ -92,12 +89,12 @@ WATER = "dvl_water_vx", "dvl_water_vy", "dvl_water_vz"
 
 @dataclass(frozen=True)
 class Pings:
-    """What n ensembles say, in SI.
+    """The values of n ensembles, in SI.
 
     Attributes
     ----------
-    time : shape (n,), as if its calendar were UTC [s since 1970]; NaN where the date is none
-    system : shape (n,), coordinates (`rovgraph.readers.trdi`)
+    time : shape (n,), as if its calendar were UTC [s since 1970]; NaN where the date is invalid
+    system : shape (n,), coordinates
     velocity, water : shape (n, 3), over the bottom and through the water, axes as `FRAME` says; NaN = none [m/s]
     error : shape (n,), error velocity of the bottom track [m/s]
     rpy : shape (n, 3), roll, pitch and heading as printed [rad]
@@ -137,7 +134,7 @@ def recording(
     Parameters
     ----------
     name : of the file's format
-    left, warnings : what its reader has to say
+    left, warnings : of its reader
 
     Raises
     ------

@@ -118,12 +118,12 @@ def _layout(head: bytes) -> TextLayout | None:
 
 
 def _seconds(table: TextTable, name: str) -> Array:
-    """A column of time, in nanoseconds unless its name says otherwise [s]."""
+    """A column of time, in nanoseconds unless its name states another unit [s]."""
     return table[name] * UNITS["time"].get(table.columns[name].unit.lower(), NS)
 
 
 def _stamps(path: Path, table: TextTable) -> tuple[Array, Clock]:
-    """Times of rows [s], NaN where there is none, and their clock: that since the start, and what it lacks of UTC."""
+    """Times of rows [s], NaN without one, and their clock: that since the start, and what it lacks of UTC."""
     unix = _unix(table)
     if table.holds(STARTUP):
         time = _seconds(table, STARTUP)
@@ -137,7 +137,7 @@ def _stamps(path: Path, table: TextTable) -> tuple[Array, Clock]:
 
 
 def _unix(table: TextTable) -> Array | None:
-    """Unix time of each row, NaN where the instrument did not know it; None where it never did."""
+    """Unix time of each row, NaN while the instrument had none; None if it never had it."""
     if table.holds(GPS):
         week, seconds = np.divmod(_seconds(table, GPS), WEEK_S)
     elif table.holds(TOW, WEEK):
@@ -164,7 +164,7 @@ def attitude_of(label: str, time: Array, xyzw: Array) -> InertialMeasurement:
 
 
 def _fixes(table: TextTable, time: Array) -> list[InertialMeasurement]:
-    """The GNSS receiver's positions, where it says that they are fixes of two or three dimensions."""
+    """The GNSS receiver's positions, where it marks them as fixes of two or three dimensions."""
     if not table.holds(*FIX[:3]):
         return []
     sds = [table[name] if name in table else np.full(len(time), np.nan) for name in FIX[3:]]

@@ -2,7 +2,7 @@
 
 Values are m/s2, rad/s, gauss and degrees relative to NED (user manuals of VN-100 and VN-200). A status ``S0000`` and a
 counter ``T0000543`` may follow them. Only ``$VNINS`` and ``$VNGPS`` have a time, so a sentence is stamped by, in this
-order: what a logger wrote before it, a counter of microseconds, its place between sentences with a time, or its number
+order: a logger's time before it, a counter of microseconds, its place between sentences with a time, or its number
 and the rate that the answer to ``$VNRRG,07`` states.
 """
 
@@ -46,7 +46,7 @@ PLACE, LOGGED, COUNT, FIRST = range(4)  # columns before the cells
 BROKEN, SHORT = "a wrong checksum, or no sentence", "cells that are missing or no numbers"
 COMMANDS = ("RRG", "WRG", "ERR", "WNV", "RST", "RFS", "TAR", "ASY")
 US, COUNT_WRAP = 1e-6, 2.0**32
-LEAST_US = 500.0  # between two messages; a counter that goes on by less counts events
+LEAST_US = 500.0  # between two messages; a counter with smaller steps counts events
 GPS_SD_S, LOGGER_SD_S = 0.02, 1.0
 
 
@@ -81,7 +81,7 @@ FORMAT = VectorNavSentences()
 
 
 def _sentence(line: bytes) -> tuple[bytes, str, bytes] | None:
-    """What is before a whole sentence, its kind, and its cells; None where the line is none."""
+    """What is before a whole sentence, its kind, and its cells; None for other lines."""
     found = SENTENCE.match(line)
     if found is None:
         return None
@@ -98,7 +98,7 @@ class _Capture:
     rows : kind -> place in the file, time that a logger wrote, counter, cells, of each whole sentence
     left : name and reason -> how many
     kinds : asynchronous messages -> their lines, broken ones included
-    rate : that the instrument said it has [Hz]; 0 = it did not
+    rate : as stated by the instrument [Hz]; 0 = not stated
     """
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ def _stamp(path: Path, tables: dict[str, Array], capture: _Capture, account: Acc
 
     Raises
     ------
-    InputError : nothing in the file tells a time
+    InputError : the file has no time
     """
     rows = np.concatenate([table[:, : FIRST + 2] for table in tables.values()])
     kinds = np.repeat([kind in TIMED for kind in tables], [len(table) for table in tables.values()])

@@ -1,9 +1,7 @@
-"""Files of Water Linked's DVLs: JSON lines as their TCP port sends them, or the same reports as rows of a CSV.
+"""Reports of Water Linked's DVLs, live and in files: JSON lines as their TCP port sends them, or rows of a CSV.
 
 The CSV is that of the maker's own script, https://github.com/waterlinked/dvl-python, whose ``log_time`` is of arrival,
 in microseconds of the recorder's Unix time.
-
-Reports of Water Linked's DVLs, as they send them (JSON over TCP) or as they were written into a file.
 
 Source: https://docs.waterlinked.com/dvl/dvl-protocol: ``time_of_validity`` is that of the reflection,
 ``time_of_transmission`` when the report leaves the DVL, both in microseconds of its clock; ``time`` is the
@@ -64,7 +62,7 @@ def is_report(row: dict[str, Any]) -> bool:
 
 
 def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
-    """What a report says of a velocity; None where it is a report of something else.
+    """The velocity of a report; None for another kind of report.
 
     Raises
     ------
@@ -314,7 +312,7 @@ class _Reports:
         index = np.flatnonzero(stamped)
         time = validity[index].copy()
         set_at = np.flatnonzero((time[:-1] < SET) & (time[1:] >= SET)) + 1
-        for at in set_at.tolist():  # the report itself says how long it came after the last one
+        for at in set_at.tolist():  # the report itself has the time since the last one
             step = since[index[at]]
             if np.isfinite(step) and 0.0 <= step < 60.0:
                 shift = time[at] - step - time[at - 1]

@@ -71,7 +71,7 @@ def _layout(head: bytes) -> TextLayout | None:
 def recording_of(
     path: Path, format_: str, table: dict[str, Array], header: str, left: Counter[str], options: ReadingOptions
 ) -> Recording:
-    """What the columns of a file become.
+    """Recording of the columns of a file.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 A message is ``FA``, bus, kind, length, data and a sum; bus to sum add up to 0 modulo 256. MTData2 is a sequence of
 items: an identifier of two bytes, a size and big-endian numbers, whose last nibble names their precision (float, fixed
-point 12.20 or 16.32, double) and the world of an attitude (ENU, NED, NWU). What it says goes where the text export's
-columns go (`rovgraph.readers.xsens`).
+point 12.20 or 16.32, double) and the world of an attitude (ENU, NED, NWU). Its items feed the same columns as the text
+export (`rovgraph.readers.xsens`).
 """
 
 import mmap
@@ -124,7 +124,7 @@ def _other(kind: int) -> str:
 def _values(
     raw: NDArray[np.uint8], at: NDArray[np.int64], length: NDArray[np.int64], left: Counter[str]
 ) -> tuple[dict[int, Array], set[str]]:
-    """Kind of item -> its numbers in every packet, NaN where there are none; and the worlds of attitudes.
+    """Kind of item -> its numbers in every packet, NaN in packets without it; and the worlds of attitudes.
 
     Packets are alike, so those of one layout are read at once.
     """
@@ -153,7 +153,7 @@ def _values(
 
 
 def _layout(packet: NDArray[np.uint8]) -> Layout:
-    """Items of a packet; one that reaches beyond its end is none."""
+    """Items of a packet; one that reaches beyond its end is left out."""
     items, at = [], 0
     while at + 3 <= len(packet):
         identifier, size = 256 * int(packet[at]) + int(packet[at + 1]), int(packet[at + 2])
@@ -187,7 +187,7 @@ def _numbers(identifier: int, data: NDArray[np.uint8]) -> Array | None:
 
 
 def _unix(time: NDArray[np.void]) -> Array:
-    """Unix time of UTC items, shape (n,) [s]; NaN while the instrument does not know it."""
+    """Unix time of UTC items, shape (n,) [s]; NaN while the instrument has none."""
     known = (time["flags"] & UTC_VALID) == UTC_VALID
     whole = unix_of_calendar(*(time[name].astype(np.int64) for name in CALENDAR))
     return np.where(known, whole + 1e-9 * time["ns"], np.nan)
@@ -221,7 +221,7 @@ def _matrices(wxyz: Array) -> Array:
 
 
 def _period(values: dict[int, Array], increment: int) -> float:
-    """Over which an increment is summed [s]; NaN where no time says."""
+    """Over which an increment is summed [s]; NaN without times."""
     if FINE not in values:
         return np.nan
     ticks = values[FINE][np.isfinite(values[increment][:, 0]), 0]

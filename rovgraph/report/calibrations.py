@@ -45,7 +45,7 @@ def write_noise(folder: Path, found: NoiseReport, config: Config) -> None:
 
 
 def magnetometer_summary(found: MagnetometerCalibration) -> dict[str, Any]:
-    """What summary.json says of a magnetometer; field in the log's unit, lengths' scatter a fraction of it."""
+    """Entries of summary.json on a magnetometer; field in the log's unit, lengths' scatter a fraction of it."""
     degrees = [None if x is None else np.rad2deg(x) for x in (found.dip, found.before.dip_rms, found.after.dip_rms)]
     disturbances = None
     if found.disturbances is not None:
@@ -75,7 +75,7 @@ def magnetometer_summary(found: MagnetometerCalibration) -> dict[str, Any]:
 
 
 def noise_summary(found: NoiseReport) -> dict[str, Any]:
-    """What summary.json says of noise; SI and radians."""
+    """Entries of summary.json on noise; SI and radians."""
     channels = {
         c.name: {
             "unit": c.unit,

@@ -1,4 +1,4 @@
-"""The colours of figures and pages: Okabe and Ito's, which the colour-blind tell apart."""
+"""The colours of figures and pages: those of Okabe and Ito, for colour-blind readers."""
 
 ESTIMATES = {"smoothed": "#0072B2", "filtered": "#D55E00", "dead_reckoning": "#888888", "reference": "black"}
 OTHER = "#CC79A7"

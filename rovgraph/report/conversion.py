@@ -34,7 +34,7 @@ def check_suffix(path: Path) -> str:
 
     Raises
     ------
-    InputError : a suffix that says nothing of the format to write
+    InputError : an unknown suffix
     """
     suffix = next((s for s in SUFFIXES if path.name.endswith(s)), None)
     if suffix is None or path.name == suffix:
@@ -43,7 +43,7 @@ def check_suffix(path: Path) -> str:
 
 
 def write_parts(parts: Sequence[Part], path: Path, progress: Progress = no_progress) -> None:
-    """Write a log as its suffix says.
+    """Write a log in the format of its suffix.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def starter(
 
     Parameters
     ----------
-    config : what is stated, and what files know
+    config : as stated, completed by the files
     counts : sensor -> number of measurements, of the log that it is for
     origin : latitude and longitude of the first fix [deg], where there is one
     sources : dotted key -> file that it comes from
@@ -146,7 +146,7 @@ def _commented(settings: Mapping[str, Any], sources: Mapping[str, str], above: s
 
 
 def conversion_tables(report: Mapping[str, Any]) -> list[Table]:
-    """What each file held, where every column came from, and how clocks were joined."""
+    """Tables of each file's contents, the origin of every column, and how clocks were joined."""
     return [_channels(report), *([_clocks(report)] if report["clocks"] else []), *_left(report)]
 
 
@@ -194,7 +194,7 @@ def _number(value: float | None) -> str:
 
 
 def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str], name: str = "") -> Table:
-    """What each column of a table may be; ``name`` tells its file from others."""
+    """Table of the guesses for each column; ``name`` distinguishes its file."""
     table = _table(
         f"columns of {name}" if name else "columns of the file", "column", "field", "unit", "why", "how sure"
     )

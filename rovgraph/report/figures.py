@@ -1,14 +1,8 @@
-"""The figures of a results folder.
+"""The figures of a results folder: track, velocity, attitude, depth, biases, calibration and innovations.
 
-Drawn with matplotlib's objects on an Agg canvas: no display, no global state of pyplot.
-
-Biases and calibration variables against time, with their priors.
-
-Velocity, attitude and depth against time.
-
-Normalised innovations of every sensor: do the measurements fit as well as believed?
-
-The track seen from above, north up, with confidence ellipses.
+Drawn with matplotlib's objects on an Agg canvas: without display and without pyplot's global state. Biases and
+calibration variables are drawn against time with their priors, the track from above, north up, with confidence
+ellipses, and normalised innovations of every sensor to show whether the measurements fit their stated noise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -222,7 +216,7 @@ def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
 
 
 def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
-    """Roll, pitch and heading with ±2 sd, and what the compasses said."""
+    """Roll, pitch and heading with ±2 sd, and the compasses' headings."""
     main, clock = estimates[0], TimeAxis.of(estimates[0])
     samples = heading_samples(main.trajectory, log, config)
     heights = (1.0, 1.0, 1.6, 1.1) if samples else (1.0, 1.0, 1.6)

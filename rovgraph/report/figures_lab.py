@@ -1,14 +1,10 @@
-"""A magnetometer before and after its calibration: the sphere from three sides, and the field's length.
+"""Figures of calibrate, compare, study, observe and plan.
 
-Noise of sensors at rest: Allan deviations with the slopes that were read, spectra with their lines named.
-
-Figures of a comparison: errors, end points, velocity, misalignment, a row or a panel per estimator.
-
-Figures of a study of the misalignment: error against time, coverage, and sd by manoeuvre and inertial unit.
-
-What a dive taught, and when; and what it left tied together.
-
-What to drive: the ranking, and the path of the best.
+`calibrate`: a magnetometer's samples before and after, as the sphere from three sides and as the field's length; noise
+of sensors at rest as Allan deviations with the fitted slopes, and as spectra with their lines named. `compare`: errors,
+end points, velocity and misalignment, a row or a panel for each estimator. `study`: error against time, coverage, and
+sd by manoeuvre and inertial unit. `observe`: what a dive shows of the calibration and when, and what it leaves
+correlated. `plan`: the ranking, and the path of the best.
 """
 
 from collections.abc import Sequence
@@ -273,7 +269,7 @@ def draw_comparison(folder: Path, comparison: Comparison, title: str, thesis: bo
 def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str, thesis: bool = False) -> Figure:
     """End, heading and velocity errors of every run as dots, their mean over runs marked; log axes.
 
-    What the reference does not know has no panel.
+    Quantities that the reference lacks have no panel.
     """
     names = table["estimator"].tolist()
     panels = {
@@ -490,7 +486,7 @@ def draw_study(folder: Path, tables: Tables) -> list[Path]:
 
 
 def draw_error(tables: Tables) -> Figure | None:
-    """Error against time: band that 90 % of the runs are in, and what the filter says, ±1.96 sd; a panel per cell."""
+    """Error against time: band that 90 % of the runs are in, and the filter's ±1.96 sd; a panel per cell."""
     names = dict(zip(tables.cells["cell"], labels(tables), strict=True))
     chosen = [cell for cell in names if (tables.history["cell"] == cell).any()][:MOST_PANELS]
     if not chosen:

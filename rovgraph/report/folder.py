@@ -1,9 +1,7 @@
-"""A results folder appears complete or not at all.
+"""Writes a results folder completely or not at all, with the versions that computed it.
 
-It is written under a temporary name beside its final place and renamed at the end, so
-that an error, a full disk or Ctrl-C leaves neither half a result nor a lost old one.
-
-Versions of what a result was computed with.
+It is written under a temporary name beside its final place and renamed at the end, so that an error, a full disk or
+Ctrl-C leaves neither half a result nor a lost old one.
 """
 
 import contextlib

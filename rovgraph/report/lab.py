@@ -1,8 +1,6 @@
-"""The files and the table of ``rovgraph compare``; docs/compare.md describes their columns.
+"""Files and tables of compare, study, observe and plan.
 
-The files and the table of ``rovgraph study misalignment``; docs/studies.md describes their columns.
-
-Files and tables of ``rovgraph observe`` and ``rovgraph plan``; docs/observability.md describes them.
+docs/compare.md, docs/studies.md and docs/observability.md describe their columns.
 """
 
 import json

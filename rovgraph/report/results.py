@@ -1,10 +1,8 @@
 """The files of a results folder other than the figures; docs/results.md describes them.
 
-Files for programs (trajectories, residuals, history) keep the units of the program, with
-a column ``unit`` where rows differ; what a person reads (calibration, summary) is in
-degrees, and says so.
-
-What of a log goes into a results folder, so that the folder tells the dive without its log.
+Files for programs (trajectories, residuals, history) keep the units of the program, with a column ``unit`` where rows
+differ; files for a person (calibration, summary) are in degrees, and state it. The folder includes the part of the log
+that its page needs.
 """
 
 import hashlib
@@ -34,7 +32,7 @@ from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
 
 LIBRARIES = ("numpy", "scipy", "pandas", "numba", "gtsam")
-NEAREST_S = 1.0  # an altitude belongs to a ping that is no further away
+NEAREST_S = 1.0  # longest time between an altitude and its ping
 
 
 def versions() -> dict[str, str]:
@@ -75,7 +73,7 @@ def dvl_frame(log: Log, frozen: Sequence[FrozenStretch] = ()) -> pd.DataFrame | 
 
     Parameters
     ----------
-    frozen : measurements that are none: such a ping saw nothing
+    frozen : invalid measurements: such a ping saw no bottom
     """
     if "dvl" not in log:
         return None
@@ -92,7 +90,7 @@ def dvl_frame(log: Log, frozen: Sequence[FrozenStretch] = ()) -> pd.DataFrame | 
 
 
 def _altitude(log: Log, time: Array) -> Array:
-    """Altitude at each time, from the nearest measurement [m]; NaN where there is none."""
+    """Altitude at each time, from the nearest measurement [m]; NaN without one near."""
     if "dvl_altitude" not in log:
         return np.full(len(time), np.nan)
     stream = log["dvl_altitude"]
@@ -118,7 +116,7 @@ def left_out_frame(
     log, config : of the dive
     residuals : of the main estimate, where a weight of 0 means rejected
     stretches : times in which a sensor contradicted all others (``sensor``, ``begin``, ``end``)
-    frozen : measurements that are none
+    frozen : invalid measurements
     """
     parts = [*_refused(log, config, frozen), _rejected(residuals, stretches)]
     whole = pd.concat(parts, ignore_index=True)
@@ -126,7 +124,7 @@ def left_out_frame(
 
 
 def _refused(log: Log, config: Config, frozen: Sequence[FrozenStretch]) -> list[pd.DataFrame]:
-    """What is none, and what a sensor's own rules keep out; the first reason that holds counts."""
+    """Invalid measurements, and those that a sensor's own rules keep out; the first reason that holds counts."""
     parts = []
     for name, stream in log.streams.items():
         if name not in SENSORS or not len(stream):
@@ -165,13 +163,13 @@ def main_first(estimates: Sequence[Estimate]) -> list[Estimate]:
 
 
 class Remarks(NamedTuple):
-    """What is said of a dive beside its estimates.
+    """Remarks on a dive beside its estimates.
 
     Attributes
     ----------
     assumptions : what was taken for granted, a sentence each
-    alarms : what the estimates say against themselves, and advice
-    warnings : what was said of the log, a line each
+    alarms : of the estimates, and advice
+    warnings : on the log, a line each
     """
 
     assumptions: Sequence[str] = ()
@@ -196,8 +194,8 @@ def write_results(
     estimates : of one log; the smoothed one leads where there is one
     log, config : what they were made from
     seconds : stage of the work -> wall time [s]
-    remarks : what is said of the dive beside them
-    frozen : measurements that are none
+    remarks : on the dive beside them
+    frozen : invalid measurements
 
     Returns
     -------
@@ -243,7 +241,7 @@ def summarise(
     seconds: Mapping[str, float],
     alarms: Sequence[Alarm] = (),
 ) -> dict[str, Any]:
-    """What summary.json holds: plain values, units in the key names, null for unknown."""
+    """Content of summary.json: plain values, units in the key names, null for unknown."""
     estimates = main_first(estimates)
     main = estimates[0]
     summary = {
@@ -270,7 +268,7 @@ def summarise(
 
 
 def to_plain(value: Any) -> Any:
-    """Only what JSON knows: NumPy becomes Python, keys become text, NaN and infinity None.
+    """Only types of JSON: NumPy becomes Python, keys become text, NaN and infinity None.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The online mode's display on a terminal: where the vehicle is, and how its sensors are."""
+"""The online mode's display on a terminal: position, and the state of the sensors."""
 
 from collections.abc import Callable
 from types import TracebackType
@@ -21,7 +21,7 @@ COLOURS = {"ok": "green", "no lock": "yellow", "rejected": "yellow", "frozen": "
 
 
 class StatusLine:
-    """Shows solutions on standard error, and nothing at all where that is no terminal.
+    """Shows solutions on standard error, if that is a terminal.
 
     `show` only keeps the solution; a thread draws it `REFRESH` times a second, so that a
     terminal that is stopped (Ctrl-S) does not hold up the estimate.
@@ -29,7 +29,7 @@ class StatusLine:
     Parameters
     ----------
     console : where to draw
-    waiting : says what the first solution waits for
+    waiting : returns what the first solution waits for
     """
 
     def __init__(self, console: Console | None = None, waiting: Callable[[], str] = str) -> None:

@@ -1,4 +1,4 @@
-"""How all figures look: sizes, colours that the colour-blind and a grey print keep apart, time axes."""
+"""The style of all figures: sizes, colours that stay distinct for the colour-blind and in grey print, time axes."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -60,7 +60,7 @@ _RC: dict[str, Any] = {
 
 @contextlib.contextmanager
 def style() -> Iterator[None]:
-    """The look of our figures, whatever the user's matplotlibrc says; restored afterwards."""
+    """The style of all figures, whatever the user's matplotlibrc; restored afterwards."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)  # type: ignore[arg-type]

@@ -1,7 +1,4 @@
-"""Tables that a command prints.
-
-A table that is wider than its terminal, as several below each other.
-"""
+"""Tables that a command prints; a table wider than its terminal is split into several below each other."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -81,7 +78,7 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
 
 
 def duration(seconds: float | None) -> str:
-    """Time as a person says it, such as ``55 min 43 s``."""
+    """Time in words, such as ``55 min 43 s``."""
     if seconds is None:
         return "unknown"
     minutes, rest = divmod(round(seconds), 60)

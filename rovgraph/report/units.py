@@ -1,4 +1,4 @@
-"""Numbers and names with units, as a person reads them."""
+"""Numbers and names with units, for people."""
 
 import numpy as np
 

@@ -1,7 +1,9 @@
-"""Every sensor in one place: measurement model, noise, admission, what it observes, and what can be wrong with it.
+"""Every sensor in one place: measurement model, noise, admission, what it observes, and its checks.
 
-One module per sensor holds its model and its `Sensor`; `SENSORS` has them all by the name of their log stream.
-docs/own-sensor.md shows how to `register` one of your own.
+May import `rovgraph.model`, `kernels` and what is below. Begin with `sensor` (`Sensor`, all that rovgraph has of one)
+and `dvl`; one module per sensor holds its model and its `Sensor`, and `SENSORS` has them all by the name of their log
+stream. The equations are in `rovgraph.kernels.measurements`. docs/own-sensor.md shows how to `register` one of your
+own.
 """
 
 from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, VEHICLE_TILT, CompassHeading, Tilt

@@ -1,6 +1,6 @@
-"""Compasses that give a heading: the IMU's own, the DVL's, and the vehicle's.
+"""Compasses that give a heading: the IMU's own, the DVL's, and the vehicle's; and the vehicle's own roll and pitch.
 
-The vehicle's own roll and pitch, which stand in for an accelerometer where there is no IMU.
+Roll and pitch replace the accelerometer where there is no IMU.
 """
 
 from dataclasses import dataclass, field

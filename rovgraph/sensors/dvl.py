@@ -17,7 +17,7 @@ from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Sa
 
 VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
 TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
-KNOWN_YAW_SD_DEG = 10.0  # sd of the yaw's prior up to which the mounting says where the rate's noise goes
+KNOWN_YAW_SD_DEG = 10.0  # sd of the yaw's prior up to which the mounting determines the direction of the rate's noise
 
 
 def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:

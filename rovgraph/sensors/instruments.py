@@ -1,4 +1,4 @@
-"""The sensors of a configuration: measurement models with the noise that is believed."""
+"""The sensors of a configuration: measurement models with the configured noise."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -17,7 +17,7 @@ from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Said, S
 # the mean field of the Earth in each unit; "1" where it was normalised
 EARTH_FIELD = {"uT": 45.0, "nT": 45e3, "mG": 450.0, "gauss": 0.45, "T": 45e-6, "1": 1.0}
 EARTH_RANGE = (0.3, 2.5)  # of it, 22 to 67 uT and as much again for iron and an uncalibrated instrument
-DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
+DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration state it
 
 
 def field_direction(declination: Array | float, dip: Array | float) -> Array:

@@ -1,12 +1,12 @@
-"""Measurement models: what simulator, graph, filters and observability know of a sensor.
+"""Measurement models, which simulator, graph, filters and observability share.
 
 Every model is a frozen object with ``predict(state, rate_b) -> (z, Jacobians)`` that
 broadcasts over epochs. The simulator samples it, the graph linearises it, filters update
 with it and observability analysis stacks it. Calibration variables are read from
 ``state.calibration``; derivatives are given for all that a model depends on.
 
-The equations and their sources stand in `rovgraph.kernels.measurements`. A model names its equation
-(``kind``) and packs its own numbers for it (``packed``, which says in what order). A model may also be
+The equations and their sources are in `rovgraph.kernels.measurements`. A model names its equation
+(``kind``) and packs its own numbers for it (``packed``, whose docstring has the order). A model may also be
 written in NumPy, as `rovgraph.sensors.thruster.ModelAiding` is.
 """
 
@@ -26,7 +26,7 @@ from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobia
 
 
 class SensorModel(Protocol):
-    """What estimators, simulator and studies know of a sensor.
+    """Measurement model of a sensor, for estimators, simulator and studies.
 
     Attributes
     ----------

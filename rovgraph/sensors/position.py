@@ -1,7 +1,4 @@
-"""Sensors of position: depth, and fixes.
-
-Places that a camera or a sonar recognises.
-"""
+"""Sensors of position: depth, fixes, and places that a camera or a sonar recognises."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -124,7 +121,7 @@ FIX = Sensor(
         Column("fix_sd", "length", optional=True, largest=5e3),
     ),
     positioning,
-    standard_deviation=own_sd(2),  # 0 is how receivers say that they do not know
+    standard_deviation=own_sd(2),  # receivers without an estimate write 0
     observes=Observed("position", (0, 1)),
     may_begin_later=True,
     occasional=True,
@@ -134,9 +131,9 @@ FIX = Sensor(
 
 @dataclass(frozen=True)
 class PlaceOffset:
-    """How far a camera or sonar is from a place that it recognises, north and east; 0 is what seeing it again says.
+    """How far a camera or sonar is from a place that it recognises, north and east; 0 when it is seen again.
 
-    Horizontally only: a pressure sensor knows the altitude better, and looking down from higher
+    Horizontally only: a pressure sensor measures the altitude better, and looking down from higher
     up shows the same place.
 
     Attributes

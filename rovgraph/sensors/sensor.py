@@ -1,7 +1,7 @@
-"""A sensor in one place: its stream, model, noise, admission, what it observes, and what can be wrong with it.
+"""A sensor in one place: its stream, model, noise, admission, what it observes, and its checks.
 
-`Sensor` carries all that rovgraph knows of one; `SENSORS` holds every sensor by the name of its log stream. Log
-reader, assembly, estimators, simulator, checks and the online mode read it.
+A `Sensor` holds everything about one sensor; `SENSORS` has every sensor by the name of its log stream. Log reader,
+assembly, estimators, simulator, checks and the online mode read it.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,13 +18,11 @@ from rovgraph.model.calibration import Variable
 from rovgraph.model.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.sensors.model import SensorModel
 
-RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that are no sensor's
-LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
+RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that belong to no sensor
+LARGEST_SD = 1e6  # of a measurement's own: larger ones add no information, and overflow
 NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 99.9, 99.99, 999 ...
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
-MOSTLY = (
-    0.5  # share of a sensor's sds, from which on they are placeholders; fewer are of measurements that tell nothing
-)
+MOSTLY = 0.5  # share of a sensor's sds, from which on they are placeholders; fewer belong to uninformative measurements
 
 Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
 Frame = Literal["position", "velocity", "heading"]
@@ -48,10 +46,10 @@ class Column:
     Attributes
     ----------
     name : as the log has it
-    quantity : what it measures, which says the units that a log may use; None = a number without a unit
+    quantity : what it measures, which defines the units that a log may use; None = a number without a unit
     optional : a measurement is complete without it
     group : the name under which a log's unit is declared; None = the sensor's
-    largest : of a measurement's own sd, what no such instrument exceeds; None = it is none, or of any size
+    largest : of a measurement's own sd, the limit of such instruments; None = it has no sd, or one of any size
     """
 
     name: str
@@ -98,7 +96,7 @@ class Instrument:
     components : names of the components, dim of them
     rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
         through the DVL's lever arm, at the nominal mounting
-    time_offset : name of the calibration variable that says how late its stamps are, or None
+    time_offset : name of the calibration variable of how late its stamps are, or None
     """
 
     model: SensorModel
@@ -118,7 +116,7 @@ class Instrument:
 
 
 class Limits(Protocol):
-    """A section of the configuration that says how far a sensor is believed."""
+    """A section of the configuration with the noise of a sensor."""
 
     @property
     def loss(self) -> str: ...
@@ -170,7 +168,7 @@ def own_sd(column: int) -> Callable[[Array, Instrument, Config], Array]:
 
 
 def placeholders(column: Column, sd: Array) -> NDArray[np.bool_]:
-    """Which sds of measurements say that the instrument does not know: 9999, 99.99, 65.535, or beyond reason.
+    """Which sds of measurements mark a missing estimate: 9999, 99.99, 65.535, or beyond reason.
 
     Parameters
     ----------
@@ -184,13 +182,13 @@ def placeholders(column: Column, sd: Array) -> NDArray[np.bool_]:
 
 
 def nothing_found(values: Array, config: Config) -> Iterator[Said]:
-    """Nothing to say of the values."""
+    """A check without findings."""
     yield from ()
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """All that rovgraph knows of a sensor.
+    """A sensor: its stream, model, noise, admission and checks.
 
     Attributes
     ----------
@@ -206,10 +204,10 @@ class Sensor:
     observes : what a filter inflates when it readmits the sensor
     linear_in : of built-in sensors, the variable that the model is linear in whatever the others are, which gives
         the filter's error its coordinates
-    heading_source : of built-in compasses, the name in ``heading.sources``, which says whether it is used
+    heading_source : of built-in compasses, the name in ``heading.sources``, which selects it
     may_begin_later : a dive online may begin before its first measurement; a compass's, where ``heading.sources``
         is given
-    occasional : it speaks only now and then, so a gap means nothing
+    occasional : it measures only now and then, so gaps are normal
     usual_rates : slowest and fastest that make sense [Hz]
     if_missing : what it means that a log has none
     look : what is wrong or worth knowing of its values, from columns, shape (n, k), and the configuration: level, text
@@ -253,7 +251,7 @@ SENSORS: dict[str, Sensor] = {}  # by name, in the order of a log's columns
 
 
 def register(sensor: Sensor) -> None:
-    """Let rovgraph know a sensor, its calibration variables and its section of the configuration.
+    """Register a sensor, its calibration variables and its section of the configuration.
 
     Do so before a configuration is loaded, and in every process that works with the sensor.
 
@@ -303,6 +301,6 @@ def unregister(name: str) -> None:
 
 
 def settings(config: Config, sensor: str) -> SensorSettings:
-    """What a configuration says of a sensor that was registered."""
+    """Section of a configuration on a registered sensor."""
     own: SensorSettings = getattr(config.sensors, sensor)
     return own

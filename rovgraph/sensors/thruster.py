@@ -1,7 +1,7 @@
-"""What a vehicle's hydrodynamics say of its velocity, as a measurement model.
+"""Velocity from thrust and drag, as a measurement model.
 
-Thrusters and drag explain the specific force that the accelerometer feels; as drag depends
-on the velocity through the water, that force measures the velocity when nothing else does
+Thrusters and drag explain the specific force that the accelerometer measures; as drag depends
+on the velocity through the water, that force measures the velocity when no other sensor does
 (Hegrenæs and Hallingstad 2011, Model-aided INS with sea current estimation). With the IMU at
 the lever arm l, v the velocity relative to the water and a(v, w) the acceleration of (2.18)
 without thrust,
@@ -9,8 +9,8 @@ without thrust,
     v = R_bn (v_n - c_n - o_n) - w x l,    w = rate - b_g
     f = a(v, w) + w x v - R_bn g_n + w x (w x l) + b_a
 
-with the current c and what waves move to and fro, o: the vehicle goes with it, so there is no drag. What it
-accelerates is in the noise.
+with the current c and the oscillation o in waves: the vehicle moves with both, so they cause no drag. Their
+accelerations are in the noise.
 
 The measurement is the mean specific force of a short piece of time less what thrust and
 angular acceleration give, M^-1 F + alpha x l, and belongs to the piece's middle. The
@@ -18,10 +18,10 @@ accelerometer also drives the IMU's factor; its noise is far below the model's e
 using it twice does no harm.
 
 A thruster follows its signal late (120 ms from 10 to 90 percent, below (2.22)). The thesis
-neglects that; but where thrust is reversed the difference is the whole of it, and of one
-sign with the velocity, which the drag coefficients take for their own. Here a thruster's turning
-is the mean of its signal over the time that a linear rise lasts, `RISE_SHARE` of which lies
-between 10 and 90 percent.
+neglects that; but where thrust is reversed the whole of it differs, with the sign of the
+velocity, so the drag coefficients would absorb it. Here a thruster's turning is the mean of its
+signal over the time that a linear rise lasts, `RISE_SHARE` of which lies between 10 and 90
+percent.
 """
 
 import math

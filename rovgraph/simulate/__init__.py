@@ -1,8 +1,11 @@
 """Simulated dives: a path, a vehicle with its sensors (`Truth`), and `simulate`.
 
-`simulated` makes one by the name of its scenario. What the simulator does (`Truth`, `World`)
-and what an estimator believes (`rovgraph.model.config.Config`) are two separate things; in a motion
-as such (`scenario`) they agree where nothing else is said.
+May import `rovgraph.inference`, `problem`, `rules`, `log`, `sensors`, `model`, `kernels` and what is below. Begin with
+`dive` (`simulate`: the models' predictions plus noise), `path` and `truth`; `simulated` makes a dive by the name of its
+scenario, `driven` one with thrusters.
+
+What the simulator does (`Truth`, `World`) and what an estimator assumes (`rovgraph.model.config.Config`) are two
+separate things; in a kinematic dive (`scenario`) they agree unless stated otherwise.
 """
 
 from rovgraph.simulate.choices import Choices

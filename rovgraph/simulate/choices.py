@@ -1,4 +1,4 @@
-"""What a person may choose of a simulated dive beside its scenario and seed."""
+"""Options of a simulated dive beside its scenario and seed."""
 
 from dataclasses import dataclass, fields
 from math import hypot, isfinite
@@ -46,8 +46,8 @@ class Choices:
 
         Raises
         ------
-        InputError : something that is no number or no pair; a duration, a time without bottom lock or a place that
-            is none
+        InputError : an entry that is not a number or a pair; an invalid duration, time without bottom lock or
+            place
         """
         self._require_numbers()
         if self.duration is not None and self.duration > DURATION_MAX:
@@ -72,7 +72,7 @@ class Choices:
                 raise InputError(f"{name} {pairs!r}: pairs of numbers are expected, as {example}")
 
     def summary(self) -> dict[str, Any]:
-        """What ``summary.json`` says: the common ones always, the others where something was chosen."""
+        """Entries of ``summary.json``: the common ones always, the others where they were chosen."""
         common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
         others = {name: getattr(self, name) for name in ("variant", "current", "disturbances")}
         others |= {name: getattr(self, name) or None for name in ("dropouts", "places", "false_places")}

@@ -3,9 +3,8 @@
 Each sensor is sampled at its own epochs by ``model.predict`` with the true state and the
 true calibration; noise and faults come on top. All randomness comes from one generator.
 
-The inertial unit: specific force and angular rate at its own place, in its own axes.
-
-At the lever arm l, with the Earth's rate w_ie where it is modelled,
+The inertial unit measures specific force and angular rate at its lever arm l, in its own axes. With the Earth's rate
+w_ie where it is modelled,
 
     f_b = R_bn (a_n + 2 w_ie x v_n - g_n) + alpha x l + w x (w x l) + 2 w_ie x (w x l)
     y   = R_sb ([f_b, w + R_bn w_ie] + bias) + noise
@@ -13,7 +12,7 @@ At the lever arm l, with the Earth's rate w_ie where it is modelled,
 which is (3.14) with alpha x l kept and the sign of gravity corrected. Biases are in body
 axes, as an estimator states them, and walk from sample to sample.
 
-Errors that last: first-order Gauss-Markov processes (Gelb 1974, 3.8) that belong to calibration variables.
+Errors that last are first-order Gauss-Markov processes (Gelb 1974, 3.8) of calibration variables.
 """
 
 from collections.abc import Mapping
@@ -52,7 +51,7 @@ def _earth_rate(config: Config) -> Array:
 
 
 def specific_force_and_rate(motion: Motion, config: Config) -> Array:
-    """What a perfect unit senses, in body axes.
+    """Measurements of a perfect unit, in body axes.
 
     Parameters
     ----------
@@ -98,7 +97,7 @@ STEPS = 50  # of a process, in its time constant
 
 @dataclass(frozen=True)
 class LastingErrors:
-    """What of the calibration changes with time.
+    """Errors that last, of calibration variables.
 
     Attributes
     ----------
@@ -122,7 +121,7 @@ def draw_lasting(
 
     Parameters
     ----------
-    truth : says which
+    truth : has their times
     calibration : where they begin
     seconds : how long they go on [s]
     rng : the same seed gives the same errors; its own stream stays as it is
@@ -158,7 +157,7 @@ class Dive:
     truth : Trajectory at the IMU's epochs, without uncertainty
     hidden : "calibration": name -> ndarray, shape (dim,), of an error that lasts at the end of the dive; "lasting":
         `LastingErrors`, all of these; "bias": ndarray, shape (n, 6), at the epochs of ``truth``; "start_offset":
-        ndarray, shape (3,) [m]; "world": name -> ndarray, what else is so and an estimator must not know
+        ndarray, shape (3,) [m]; "world": name -> ndarray, other true values, hidden from an estimator
     path : the path that was followed
     """
 
@@ -231,7 +230,7 @@ class _Sampler:
         self.covariances = truth.covariances if truth.noise else None
 
     def motion(self, sensor: str, path: Path, stamps: Array) -> Motion:
-        """The motion that a sensor measured: stamps are as late as its time offset says."""
+        """The motion that a sensor measured: stamps are late by its time offset."""
         offset = self.instruments[sensor].time_offset
         late = 0.0 if offset is None else float(self.calibration[offset][0])
         return path.motion(np.clip(stamps - late, 0.0, path.duration))

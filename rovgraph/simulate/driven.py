@@ -1,7 +1,11 @@
-"""A motion driven through the thrusters: the equations of motion, integrated at 100 Hz.
+"""Dives driven through the thrusters: the world, the pilots, the equations of motion, and scenarios.
 
-`rovgraph.model.hydrodynamics` states the equations; here they stand once more in plain floats, since a
-step of a hundredth of a second is too short for arrays (a test compares the two). With c the
+`World` draws from a seed what an estimator has no access to: the sea, the vehicle's drag, iron on the seabed and the
+field in the lake. It has a pilot drive in it, and gives the true values that sensors measure. docs/simulation.md has
+the sources of the figures. The dives of the thesis, and others, are functions from a `World` to its path and truth.
+
+The equations of motion are integrated at 100 Hz. `rovgraph.model.hydrodynamics` states them; here they are repeated in
+plain floats, since a step of a hundredth of a second is too short for arrays (a test compares the two). With c the
 velocity of the water and v that of the vehicle relative to it, body axes,
 
     M v' = F + D(v) - w x M v
@@ -11,26 +15,15 @@ velocity of the water and v that of the vehicle relative to it, body axes,
 integrated by the rule of Adams and Bashforth of second order. Water that accelerates tilts
 the pressure, and with it the direction of buoyancy: B = -m (g - c_n').
 
-Pilots: from where the vehicle is to the signals of its thrusters.
+Pilots compute the thrusters' signals from the vehicle's true state. A pilot has a desired velocity (surge, sway, heave,
+yaw rate). `VelocityControl` turns it into forces: the drag of the desired velocity, a part proportional to the velocity
+error and its integral (which finds the current), spread over the thrusters by the pseudo-inverse of their allocation
+and turned into signals by the inverse of (2.21). `Autopilot` follows a route: along the line of sight to a point ahead
+on the leg (Fossen 2011, Handbook of Marine Craft Hydrodynamics and Motion Control, 10.3), slower in turns and before a
+stop, on station where a route pauses. `Steps` leaves one axis uncontrolled and pushes there with a given force.
 
-A pilot wants a velocity (surge, sway, heave, yaw rate). `VelocityControl` turns it into
-forces: the drag of the wanted velocity, a part proportional to what is missing and its
-integral (which finds the current), spread over the thrusters by the pseudo-inverse of their
-allocation and turned into signals by the inverse of (2.21). `Autopilot` wants what follows a
-route: along the line of sight to a point ahead on the leg (Fossen 2011, Handbook of Marine
-Craft Hydrodynamics and Motion Control, 10.3), slower in turns and before a stop, on station
-where a route pauses. `Steps` wants nothing on one axis and pushes there with a given force.
-
-Pilots know where the vehicle is: they stand for a person at the camera who sees the cable on
-the seabed (1.6), and no estimate of ours takes part. The gains are choices.
-
-What is so in a dive that is driven through the thrusters, and that an estimator does not know.
-
-`World` draws from a seed the sea, the vehicle's drag, iron on the seabed and the field in the
-lake, has a pilot drive in it, and says what the sensors obey. docs/simulation.md has the
-sources of the figures.
-
-The dives of the thesis, and others, each as a function from a `World` to its path and truth.
+Pilots use the true position: they stand for a person at the camera who sees the cable on the seabed (1.6), and no
+estimate takes part. The gains are choices.
 """
 
 from collections.abc import Callable
@@ -67,7 +60,7 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Craft:
-    """What a pilot sees of the vehicle.
+    """Motion of the vehicle as a pilot sees it.
 
     Attributes
     ----------
@@ -488,7 +481,7 @@ class Driven:
     ----------
     make : from a world to a path and what its sensors obey
     choices : names of the choices it has
-    variants : that it has, the first is the default unless ``about`` says otherwise
+    variants : that it has, the first is the default unless ``about`` states another
     about : one line for people
     """
 

@@ -1,16 +1,14 @@
-"""Magnetism around a simulated vehicle: iron on the ground, and what the vehicle's own iron does.
+"""The environment of a simulated vehicle: magnetic fields of iron, and water in motion.
 
-An object of iron is a dipole of moment m at the distance r,
+An object of iron on the ground is a dipole of moment m at the distance r,
 
     B = mu0 / (4 pi |r|^3) (3 (m . u) u - m),  u = r / |r|
 
-A magnetometer feels B where it is. A compass turns with the horizontal part of the whole
-field where *it* is.
+A magnetometer measures B where it is. A compass turns with the horizontal part of the whole field where *it* is. The
+vehicle's own iron moves with the vehicle.
 
-The water that a vehicle moves in: a current and the orbits of small waves.
-
-Linear waves in deep water: a wave of amplitude A and angular frequency s moves the water at
-depth z on circles with the speed A s exp(-k z), k = s^2 / g, along its direction and, a
+The water has a current and the orbits of small waves. Linear waves in deep water: a wave of amplitude A and angular
+frequency s moves the water at depth z on circles with the speed A s exp(-k z), k = s^2 / g, along its direction and, a
 quarter of a period apart, vertically. All water around the vehicle moves as one.
 """
 
@@ -26,7 +24,7 @@ from rovgraph.sensors.instruments import DEFAULT_DIP
 from rovgraph.simulate.path import Path
 
 EARTH_FIELD_T = 50.5e-6  # magnitude in southern Sweden, the unit of the thesis's normalised field [T]
-# Moment of iron by its mass: 1000 kg are felt as 1 nT at 30 m (a rule of Geometrics'), which is
+# Moment of iron by its mass: 1000 kg give 1 nT at 30 m (a rule of Geometrics'), which is
 # 2e-7 m / 30^3 = 1 nT for an induced 0.135 A m^2/kg; what iron keeps of its past is a few times
 # as much (Breiner 1973, Applications manual for portable magnetometers: 0.1 to 1 A m^2/kg).
 INDUCED_PER_KG = 0.135
@@ -79,13 +77,13 @@ class Distortion:
     offset: Array
 
     def raw(self, field: Array) -> Array:
-        """What the magnetometer says of a field, both of shape (n, 3)."""
+        """The magnetometer's reading of a field, both of shape (n, 3)."""
         return np.asarray((field - self.offset) / self.scale)
 
 
 @dataclass(frozen=True)
 class Magnetism:
-    """What is magnetic beside the calibration variables.
+    """Magnetic disturbances beside the calibration variables.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
 """A simulated dive as files.
 
-``log.csv`` what the vehicle recorded, ``config.yaml`` what an estimator may know,
-``truth.csv`` and ``truth.json`` what it may not, ``summary.json`` what was made.
+``log.csv`` is the vehicle's recording and ``config.yaml`` the estimator's configuration; ``truth.csv`` and
+``truth.json`` are hidden from the estimator; ``summary.json`` lists the options.
 """
 
 import json
@@ -39,7 +39,7 @@ def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]
     dive : Dive
     config : the configuration that the dive was simulated with; the start that is written
         is the planned one
-    summary : what ``summary.json`` says beside the figures of the dive
+    summary : entries of ``summary.json`` beside the figures of the dive
     """
     write_log(dive.log_frame, folder / "log.csv")
     step = max(round(1.0 / (TRUTH_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
@@ -58,9 +58,9 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 
 
 def known(dive: Dive, config: Config) -> Config:
-    """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns.
+    """The estimator's configuration, with the planned start, for a log in rovgraph's own columns.
 
-    The simulated magnetometer needs no calibration, and stamps are not late. Compasses err as their priors say, from
+    The simulated magnetometer needs no calibration, and stamps are not late. Compasses err by their priors, from
     which their errors were drawn.
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
@@ -70,7 +70,7 @@ def known(dive: Dive, config: Config) -> Config:
 
 
 def secrets(dive: Dive) -> dict[str, Any]:
-    """What an estimator must not know: calibration, biases and the start's error."""
+    """Values hidden from an estimator: calibration, biases and the start's error."""
     return {
         "units": "radians and SI; bias: accelerometer x y z, gyro x y z, body axes",
         "calibration": {name: value.tolist() for name, value in dive.hidden["calibration"].items()},

@@ -1,4 +1,4 @@
-"""A dive by the name of its scenario, with the configuration that an estimator may know."""
+"""A dive by the name of its scenario, with the configuration for an estimator."""
 
 import difflib
 from dataclasses import replace
@@ -55,7 +55,7 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
 
     Returns
     -------
-    Dive, and the Config that an estimator may know: with the planned start
+    Dive, and the Config for an estimator: with the planned start
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A path: the smooth motion of the body's origin that a simulated dive follows.
+"""A path: the smooth motion of the body's origin that a simulated dive follows, and the route that it is made from.
 
 Position and roll, pitch, yaw are quintic splines in time, so that velocity, acceleration,
 angular rate and angular acceleration are their exact derivatives. With the Euler angles
@@ -8,9 +8,7 @@ angular rate and angular acceleration are their exact derivatives. With the Eule
     w_y = p' cos r + y' cos p sin r
     w_z = y' cos p cos r - p' sin r
 
-and the angular acceleration its derivative.
-
-A route: points to pass, before it becomes a smooth path in time.
+and the angular acceleration its derivative. A route is a list of points to pass, which becomes a path in time.
 """
 
 from dataclasses import dataclass, field, replace

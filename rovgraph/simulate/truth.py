@@ -1,6 +1,6 @@
-"""What the simulated vehicle does, apart from what an estimator believes of it.
+"""The simulated vehicle's true constants, noise and faults, apart from what an estimator assumes.
 
-Noise of the thesis's sensors: full covariances, and a line in the accelerometer.
+Includes the noise of the thesis's sensors: full covariances, and a line in the accelerometer.
 """
 
 import zlib

@@ -1,8 +1,7 @@
-"""News to every page that watches: encoded once, and a page that does not read is dropped.
+"""Sends news to every page: encoded once, and a page that does not read is dropped.
 
-Connections of clients that may be slow, silent or hostile: none is held for longer than its deadline.
-
-uvicorn by itself waits for a request as long as its client likes, and keeps a closed connection until all is read.
+Connections of clients may be slow, silent or hostile: each has a deadline. uvicorn by itself waits for a request
+without limit, and keeps a closed connection until all is read.
 """
 
 import asyncio
@@ -29,7 +28,7 @@ PING_S, PONG_S = 5.0, 10.0  # between pings to a page, and for it to answer one
 FAREWELL_S = 5.0  # for a WebSocket to end after its page was dropped
 UNANSWERED = 1011  # a WebSocket's code of a ping without an answer
 
-_faults = logging.getLogger(__name__)  # of ours: what clients do wrong is not the pilot's to read
+_faults = logging.getLogger(__name__)  # of the server alone: errors of clients are of no use to the pilot
 _faults.setLevel(logging.ERROR)
 
 
@@ -65,14 +64,14 @@ class Connection(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def _expect(self, seconds: float | None) -> None:
-        """Set the deadline again; None = there is none."""
+        """Set the deadline again; None = no deadline."""
         if self._deadline is not None:
             self._deadline.cancel()
         self._deadline = None if seconds is None else self.loop.call_later(seconds, self.transport.abort)
 
 
 class PageSocket(WebSocketsSansIOProtocol):
-    """A WebSocket that tells when its page answers no ping, and waits for nobody to read what is left."""
+    """A WebSocket that reports when its page answers no ping, and drops unread messages at its end."""
 
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
@@ -94,7 +93,7 @@ def unanswered(gone: WebSocketDisconnect) -> bool:
 
 
 PERIOD_S = 0.05  # least time between messages to a page
-IDLE_S = 1.0  # after which a page is told that there is nothing new
+IDLE_S = 1.0  # after which a page is sent a message without news
 STALL_S = 5.0  # a page that takes longer to read one message, when its buffers are full, is dropped
 MOST_PAGES = 32
 
@@ -122,7 +121,7 @@ class Broadcast:
         self._woken = False
         self._arrived = asyncio.Event()
         self._news, self._edition = asyncio.Condition(), 0
-        self._encoded: dict[Cursor, tuple[str | None, Cursor]] = {}  # what each is told, and has then
+        self._encoded: dict[Cursor, tuple[str | None, Cursor]] = {}  # message to each, and its cursor after it
 
     def put(self, solution: Solution) -> None:
         """Take a solution; in the estimator's thread, and all that is done there."""
@@ -158,7 +157,7 @@ class Broadcast:
                 await asyncio.sleep(0)
 
     async def serve(self, socket: WebSocket) -> None:
-        """All of the track to a page, then news, until it goes, speaks or does not read."""
+        """All of the track to a page, then news, until it closes, sends or does not read."""
         if self.pages >= MOST_PAGES:
             await socket.close(1013, f"{MOST_PAGES} pages watch already")
             return
@@ -208,7 +207,7 @@ class Broadcast:
                 for piece in pieces:
                     await self._send(socket, f'{{"type":"track","points":{piece}}}')
             if cursor not in self._encoded:
-                told = view.cursor  # before: marks that change meanwhile are told again
+                told = view.cursor  # before: marks that change meanwhile are sent again
                 self._encoded[cursor] = view.update(cursor), told
             message, told = self._encoded[cursor]
             cursor = None if message is None else told
@@ -226,7 +225,7 @@ class Broadcast:
 
 
 async def _silence(socket: WebSocket) -> None:
-    """Return when a page goes, or says something, which pages do by requests only.
+    """Return when a page closes, or sends a message, which pages do by requests only.
 
     Raises
     ------

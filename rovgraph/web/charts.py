@@ -1,7 +1,7 @@
 """Background charts: GeoTIFF, GeoJSON and folders of tiles, placed on the estimate's map.
 
-A chart knows degrees, the map metres north and east of an origin that may become known only with the first fix; so a
-chart is read before the dive and placed when a page asks for it.
+A chart is in degrees, the map in metres north and east of an origin that may become known only with the first fix; so a
+chart is read before the dive and placed when a page requests it.
 """
 
 import json
@@ -40,7 +40,7 @@ class Chart(ABC):
 
     @abstractmethod
     def placed(self, place: Place) -> dict[str, Any]:
-        """What a page needs to draw it."""
+        """Data for a page to draw it."""
 
 
 class ImageChart(Chart):

@@ -1,11 +1,9 @@
-"""Who may see the page, and who may change anything: in front of every request.
+"""Access control of the page, for every request: who may see it, who may change anything, and where it is served.
 
 On the loopback, another site that is open in the pilot's browser is the danger: requests have to name this computer
 (against DNS rebinding), and what changes something, or streams, has to come from the page itself (against request
-forgery and WebSocket hijacking). Elsewhere a token is asked for as well. It travels in a header, which a foreign page
-cannot set and which no log of addresses holds; there are no cookies.
-
-Where the page is served, and who may see it.
+forgery and WebSocket hijacking). Elsewhere a token is required as well. It is sent in a header, which a foreign page
+cannot set and logs of addresses do not contain; cookies are not used.
 """
 
 import hmac
@@ -51,7 +49,7 @@ class ListenAddress:
 
     @property
     def url(self) -> str:
-        """What a person opens, on this computer."""
+        """URL for a person on this computer."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}/"
 
@@ -95,7 +93,7 @@ def parse_origin(text: str) -> str:
 
     Raises
     ------
-    InputError : it is none
+    InputError : it is not such an origin
     """
     try:
         parts = urlsplit(text)

@@ -1,15 +1,10 @@
-"""The server of the live page, in a thread of its own.
+"""The server of the live page, in a thread of its own, and its addresses; docs/live-page.md lists them.
 
-The addresses of the page: docs/live-page.md lists them.
+Beside the page there are addresses for BlueOS, Cockpit and Prometheus. BlueOS looks for ``/register_service`` on every
+port, Cockpit for the widgets that ``cockpit_extras`` names. Cockpit's data lake takes ``name=value`` from a WebSocket,
+one value per message. Prometheus reads the newest state as metrics.
 
-Where pilots already look: what BlueOS and Cockpit ask of an extension.
-
-BlueOS looks for ``/register_service`` on every port, Cockpit for the widgets that ``cockpit_extras`` names. Cockpit's
-data lake takes ``name=value`` from a WebSocket, one value per message.
-
-The newest state as Prometheus metrics.
-
-From the body of a request to a command, or to one line that says what is wrong with it.
+The body of a request becomes a command, or a refusal of one line.
 """
 
 import asyncio
@@ -431,11 +426,11 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 START_S, CLOSE_S = 10.0, 2.0
 MOST_CONNECTIONS = 64
-LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, which has nothing to say [bytes]
+LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, on which pages send no data [bytes]
 
 
 class LivePage:
-    """Shows solutions to whoever opens the page.
+    """Shows solutions to all that open the page.
 
     `send` is called with each solution and only queues it. The server stops with `close`, or at the end of a ``with``.
 
@@ -448,7 +443,7 @@ class LivePage:
     origins : of other pages that may frame this one
     token : file that keeps the token; None = a new one each time
     limits : beyond which the page raises an alarm
-    warnings : told if the server fails
+    warnings : receives a failure of the server
 
     Attributes
     ----------
@@ -457,7 +452,7 @@ class LivePage:
 
     Raises
     ------
-    InputError : an address that cannot be listened at, a chart that cannot be read, an origin or token that is none
+    InputError : an address that cannot be listened at, a chart that cannot be read, an invalid origin or token
     """
 
     def __init__(
@@ -502,7 +497,7 @@ class LivePage:
 
     @property
     def url(self) -> str:
-        """What a person opens; a token stands behind ``#``, which browsers keep to themselves."""
+        """URL for a person; a token follows ``#``, which browsers do not send."""
         return self.address.url if self.token is None else f"{self.address.url}#token={self.token}"
 
     def send(self, solution: Solution) -> None:
@@ -526,5 +521,5 @@ class LivePage:
     def _run(self) -> None:
         try:
             self._server.run(sockets=[self._socket])
-        except Exception as error:  # the estimate goes on without its page
+        except Exception as error:  # the estimate continues without its page
             self._warnings.complain(self.address.url, "failed", f"the page is gone: {type(error).__name__}: {error}")

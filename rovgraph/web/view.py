@@ -1,6 +1,6 @@
-"""What pages see of a dive: its newest state, its track, its events. Belongs to the server's thread.
+"""The data that pages show of a dive: its newest state, its track, its events. Belongs to the server's thread.
 
-The track so far, in pieces that are encoded once for all pages.
+`LiveTrack` holds the track so far in pieces that are encoded once for all pages.
 """
 
 import json
@@ -100,7 +100,7 @@ UNITS = {  # of each calibration variable: factor to what a person reads, and it
     for factor, unit in [shown(variable.unit)]
     for label in variable.labels
 }
-STALE_S = 2.0  # without a solution, after which a page says so
+STALE_S = 2.0  # without a solution, after which a page shows it
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class PageLimits:
 
 @dataclass(frozen=True)
 class Cursor:
-    """What a page has: points of an edition of the track, events, and an edition of the marks, -1 = none."""
+    """State of a page: points of an edition of the track, events, and an edition of the marks, -1 = none."""
 
     edition: int
     points: int
@@ -128,7 +128,7 @@ class Cursor:
 
 
 class View:
-    """Takes solutions in the order of time, and says what is new to a page.
+    """Takes solutions in the order of time, and returns what is new to a page.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class View:
     @property
     def cursor(self) -> Cursor:
         """Of a page that has everything."""
-        marks = -1 if self.newest is None else self.marks.edition  # before a first solution they are not told
+        marks = -1 if self.newest is None else self.marks.edition  # before a first solution they are not sent
         return Cursor(self.track.edition, len(self.track), self._numbered, marks)
 
     def events(self, since: int = 0) -> list[dict[str, Any]]:
@@ -189,7 +189,7 @@ class View:
         }
 
     def update(self, cursor: Cursor) -> str | None:
-        """What is new since a page was told last, as a message; None where it needs the whole track again."""
+        """News since the last message to a page, as a message; None where it needs the whole track again."""
         if cursor.edition != self.track.edition:
             return None
         new = {"points": self.track.since(cursor.points), "events": self.events(cursor.events)}

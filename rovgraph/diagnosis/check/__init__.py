@@ -1,12 +1,11 @@
-"""Is this log sane? And what would an estimate make of it?
+"""Checks of a log before an estimate: units, signs, axes, clocks, contradictions.
 
-`examine` runs every check of `CHECKS` and collects what they find; `warn` is for commands
-that go on to work with the log. A check takes a log and a configuration and yields
-findings; it knows nothing of other checks.
+`examine` runs every check of `CHECKS` and collects the findings; `warn` is for commands that then work with the log. A
+check takes a log and a configuration and yields findings, independently of other checks. May import what
+`rovgraph.diagnosis` may. Begin with `values` (one sensor by itself) and `agreement` (two sensors of one motion).
 
-What an estimate would make of a log: heading sources, keyframes, assumptions.
-
-Places seen before: how often each was, since one that is seen once adds no information.
+`plan` is a preview of the estimate: heading sources, keyframes, assumptions. `places` counts the sightings of each
+place, since a place seen once adds no information.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,7 +31,7 @@ from rovgraph.sensors.instruments import heading_sources
 
 
 def plan(log: Log, config: Config) -> Iterator[Finding]:
-    """What would be used, and what is assumed where the configuration says nothing."""
+    """Sensors that would be used, and assumptions where the configuration states no value."""
     sources = heading_sources(config, log.sensors)
     yield Finding("configuration", "ok", f"heading from {', '.join(sources) or 'the start only'}")
     wanted = {sensor.heading_source: sensor.name for sensor in SENSORS.values()}
@@ -141,7 +140,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     ----------
     log : as read
     config : what is believed of the vehicle; defaults where it is not given
-    examined : what `bridge_jumps` knows of the log with this configuration
+    examined : result of `bridge_jumps` for the log with this configuration
     """
     config = Config() if config is None else config
     frozen = frozen_stretches(log, config)

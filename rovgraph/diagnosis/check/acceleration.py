@@ -1,4 +1,4 @@
-"""The DVL's acceleration against the IMU's: which axes, and which shift of its stamps, make the two agree.
+"""The DVL's acceleration against the IMU's: the axes and the time offset that make the two agree.
 
 With z the velocity along the body's axes, y along the instrument's and H one of the 48 ways to name three axes,
 
@@ -6,7 +6,7 @@ With z the velocity along the body's axes, y along the instrument's and H one of
 
 where a_b is the IMU's acceleration without gravity, taken to the DVL's place (`inertial`). Heading does not enter.
 The sum of squared differences is quadratic in H, so a few dozen cross-correlations, by FFT, give it for every H at
-every tau. `refine` then fits tau together with what else may be a little wrong: mounting, scale and lever arm.
+every tau. `refine` then fits tau together with small errors of mounting, scale and lever arm.
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ class Search:
 
 @dataclass(frozen=True)
 class AccelerationFit:
-    """What makes the DVL agree with the IMU.
+    """Axes, time offset and mounting that make the DVL agree with the IMU.
 
     Attributes
     ----------

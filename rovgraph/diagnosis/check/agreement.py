@@ -1,6 +1,6 @@
-"""Whether sensors that see the same motion agree: sign, scale, and clock.
+"""Agreement of sensors that measure the same motion: sign, scale, and clock.
 
-Each comparison takes what two sensors say of the change within windows of some seconds
+Each comparison takes the changes that two sensors measure within windows of some seconds
 (`rovgraph.diagnosis.check.lags`).
 """
 
@@ -27,14 +27,14 @@ from rovgraph.sensors.dvl import other_way_up
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
-LEAST_STEP = 0.3  # of a depth whose zero is set anew [m]
+LEAST_STEP = 0.3  # of a depth whose zero is set again [m]
 STEPS = 10.0  # times its usual change against the DVL's way
 MOST_STEPS = 3
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
 LEAST_LEVEL = 0.1  # cos(pitch)^2 below which a heading turns at any rate
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading", "vehicle_heading": "heading"}
 ZEROS = {"enu": "east", "nwu": "north"}  # of headings that count anticlockwise
-FITS = 0.25 * np.pi  # turn of the DVL's track against the fixes, by which one of them is told
+FITS = 0.25 * np.pi  # turn of the DVL's track against the fixes, beyond which one of them is reported
 
 
 def headings(log: Log, config: Config) -> Iterator[Finding]:
@@ -46,7 +46,7 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
     for sensor in sensors:
         if sensor == "mag" and motion is not None and (wrong := [*field_axes(log, config, motion)]):
             yield from wrong
-            if wrong[0].sensor == "imu":  # a gyro that is wrong tells nothing of other compasses
+            if wrong[0].sensor == "imu":  # a wrong gyro cannot judge other compasses
                 return
             continue
         heading = _heading(log, config, sensor, motion)
@@ -271,7 +271,7 @@ def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Sign
 
 
 def _without_steps(depth: Signal, dvl: Signal, window: float) -> Signal:
-    """A depth without changes of its zero, which the DVL's way does not have and which say nothing of the DVL."""
+    """A depth without changes of its zero, which are not motion and do not concern the DVL."""
     change = np.diff(depth.value - dvl.at(depth.time, window))
     usual = float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else np.inf
     steps = np.where(np.abs(change) > max(LEAST_STEP, STEPS * usual), change, 0.0)  # not where the DVL is lost
@@ -280,7 +280,7 @@ def _without_steps(depth: Signal, dvl: Signal, window: float) -> Signal:
 
 
 def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
-    """Correlation of depth with the way downwards by a DVL with a mounting; 0 if nothing is to be seen."""
+    """Correlation of depth with the way downwards by a DVL with a mounting; 0 without depth changes."""
     if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
         return 0.0
     pings = valid_pings(log["dvl"])

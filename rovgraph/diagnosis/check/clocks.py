@@ -1,14 +1,14 @@
-"""Which sensors there are, and when their measurements came.
+"""Clocks of a log: which sensors it has, when they measured, and clocks that jump or have different epochs.
 
-Clocks that jump within a dive: where the DVL's lag against the IMU is another before and after a gap of one of them.
+`presence`, `overlap` and `regularity` list sensors and the times of their measurements.
 
-A clock that is set leaves a gap in the stamps of the instrument that it belongs to. Where the lag before and after is
-known, and the gap says whose clock it is, the later stamps are put back by the difference (`bridge_jumps`).
+`find_jump` finds clocks that jump within a dive, where the DVL's lag against the IMU differs before and after a gap of
+one of them. A clock that is set leaves a gap in the stamps of its instrument. Where the lag before and after is known,
+and the gap shows whose clock it is, `bridge_jumps` corrects the later stamps by the difference.
 
-How far apart the clocks of two recordings are that share no time: by the motion that both show.
-
-The stream is first put where its start meets that of the IMU; what is left, up to minutes, is searched for as between
-clocks of one epoch. So clocks may be any time apart, if the recordings are of one dive.
+`shift_of_epoch` finds the shift between recordings whose clocks have no common epoch, by the motion that both show. The
+stream is first put where its start meets that of the IMU; the remainder, up to minutes, is searched as between clocks
+of one epoch. So clocks may be any time apart, if the recordings are of one dive.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,7 +42,7 @@ GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
 MOST_JUMPS = 5  # of one dive, that are bridged
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
-SMALL_S = 0.05  # between the gap and the jump, that tells of nothing missing [s]
+SMALL_S = 0.05  # difference of gap and jump up to which no samples are missing [s]
 CLOCKED = {  # by one clock
     "imu": ("imu", "mag", "ahrs"),
     "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", BEAMS),
@@ -56,8 +56,8 @@ class Jump:
 
     Attributes
     ----------
-    sensor : whose clock it is, "imu" or "dvl"; "" where no gap tells
-    before, after : stamps around it, equal where no gap tells [s]
+    sensor : whose clock it is, "imu" or "dvl"; "" where no gap shows it
+    before, after : stamps around it, equal without a gap [s]
     period : of the sensor [s]
     lags : how late the DVL's stamps are against the IMU's before and after [s]
     sd : of the difference of both [s]
@@ -83,7 +83,7 @@ class Jump:
         return bool(self.sensor) and self.sd < SURE_S and 0.0 < self.by < self.after - self.before
 
     def finding(self, log: Log) -> Finding:
-        """What to say of it."""
+        """Its description."""
         first, second = (round(lag, 1) + 0.0 for lag in self.lags)  # no minus before a zero
         told = (
             f"the DVL's stamps are {first:.1f} s late relative to the IMU's before {since(log, self.before)} "
@@ -155,7 +155,7 @@ def _refined(compared: DvlAgainstImu, split: Jump, lags: list[float]) -> Jump:
 
 
 def bridge_jumps(log: Log, config: Config) -> tuple[Log, Examined | None]:
-    """A log whose clocks go on: where a gap tells whose clock was set, its later stamps are put back by as much.
+    """A log with continuous clocks: where a gap shows whose clock was set, its later stamps are put back by as much.
 
     Returns
     -------
@@ -210,7 +210,7 @@ def _jumps_at_gaps(stream: Stream) -> list[Jump]:
 
 
 def shift_of_epoch(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
-    """How much later the stamps of a sensor are than the IMU's, and its sd [s]; None where the motion does not tell.
+    """How much later the stamps of a sensor are than the IMU's, and its sd [s]; None where the motion does not show it.
 
     Parameters
     ----------

@@ -1,13 +1,13 @@
 """The vehicle's heading by each compass, and which axes of the magnetometer agree with the gyro.
 
-In the IMU's axes the Earth's field turns as m' = -w x m. With y what is measured, c its hard iron and m = H (y - c) for
-a signed permutation H,
+In the IMU's axes the Earth's field turns as m' = -w x m. With y the measured field, c its hard iron and m = H (y - c)
+for a signed permutation H,
 
     y' = -A w x (y - c),  A = det(H) H',
 
-so H and -H are alike, which the field's dip decides, and A is a rotation. One that is not belongs to the gyro, and so
-does one that turns gravity as well. Changes over some seconds are compared, with c and the gyro's bias free. A vehicle
-that turns about one axis only leaves several A alike.
+so H and -H fit equally, which the field's dip decides, and A is a rotation. If A is not a rotation, or turns gravity as
+well, the gyro's axes are wrong. Changes over some seconds are compared, with c and the gyro's bias free. In a dive that
+turns about one axis only, several A fit equally.
 """
 
 from collections.abc import Iterator
@@ -39,10 +39,10 @@ COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading th
 FOLLOWS_GYRO = 10.0  # before and after, over which a magnetometer's heading is averaged against the gyro's [s]
 WINDOW = 2.0  # over which the field's change is compared [s]
 ENOUGH_WINDOWS = 30
-TELLING = 0.3  # of the largest changes, from which on a window tells two axes apart
+TELLING = 0.3  # of the largest changes, from which on a window distinguishes two axes
 EXPLAINED = 0.5  # of the changes' square, that a rotation may leave at most
 BETTER = 3.0  # times smaller a square than as configured, which neither noise nor iron makes
-SIMILAR = 1.3  # times the least square, that tells two rotations apart no more
+SIMILAR = 1.3  # times the least square, up to which two rotations are not distinguished
 EVIDENCE = 60.0  # in chi-square
 LEVEL = 0.1  # of the field along the vertical, whose sense shows nothing
 UPSIDE_DOWN = 0.5  # of the field along the vertical in the wrong sense, which no iron makes
@@ -70,7 +70,7 @@ def compass_heading(log: Log, config: Config, sensor: str) -> Array:
 
 
 def body_heading(log: Log, config: Config) -> tuple[str, Array, Array] | None:
-    """The compass that tells the body's true heading best, its times and headings without jumps [rad].
+    """The compass that gives the body's true heading best, its times and headings without jumps [rad].
 
     One that is in use goes first, and of these one that gives a heading itself. That of a magnetometer is levelled by
     the IMU, freed of hard iron within its prior, and follows the gyro from moment to moment.
@@ -118,7 +118,7 @@ class TurningFit:
     ----------
     square : ndarray, shape (m,), mean squared residual, relative to that without any turn
     offset : ndarray, shape (m, 3), constant part of the measured vector that does not turn
-    windows : how many change enough to tell
+    windows : how many change enough to be used
     """
 
     square: Array
@@ -127,7 +127,7 @@ class TurningFit:
 
     @property
     def alike(self) -> NDArray[np.int64]:
-        """The best of `ORIENTATIONS`, and those that cannot be told from it; none where it explains too little."""
+        """The best of `ORIENTATIONS`, and those that fit equally; empty where it explains too little."""
         best = float(self.square.min())
         return np.flatnonzero((self.square <= SIMILAR * best) & (best < EXPLAINED))
 
@@ -185,7 +185,7 @@ def turning(
 
 
 def _fit(left: Array, J: Array, telling: NDArray[np.bool_]) -> tuple[float, Array]:
-    """Mean square of what a fit leaves of (m, 3), where it tells, large residuals clipped; and what it found [sds]."""
+    """Mean square residual of a fit, (m, 3), where it changes enough, large ones clipped; and its result [sds]."""
     keep, variance = np.ones(len(left), dtype=bool), 0.0
     for _ in range(2):
         rows = J[keep].reshape(-1, J.shape[2])
@@ -227,7 +227,7 @@ def field_axes(log: Log, config: Config, motion: InertialMotion) -> Iterator[Fin
 
 
 def _opposite_compass(log: Log, config: Config, motion: InertialMotion) -> str:
-    """A compass that turns opposite to the gyro, too; "" if there is none."""
+    """A compass that turns opposite to the gyro, too; "" without one."""
     by_gyro = Signal(motion.time, np.cumsum(motion.turning) * motion.step)
     for sensor in COMPASSES:
         if sensor in log and len(log[sensor]) >= MIN_WINDOWS:
@@ -300,7 +300,7 @@ def _orientation(log: Log, config: Config, motion: InertialMotion, field: Turnin
 def field_in_body(log: Log, config: Config, down_b: Array, offset: Array, H: Array = AS_NAMED) -> Array:
     """The field in body axes, its own axes renamed by H, without the level part of its hard iron; shape (n, 3).
 
-    Of the other part, turns about the vertical tell nothing but the gyro's noise.
+    Of the other part, turns about the vertical show only the gyro's noise.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def _dip_sense(log: Log, config: Config) -> float:
 
 
 def _same_heading(log: Log, config: Config, psi: Array) -> bool:
-    """Whether headings of the magnetometer are those of the other compasses, about; True if there is none."""
+    """Whether headings of the magnetometer are those of the other compasses, about; True without one."""
     for sensor in COMPASSES:
         if sensor in log and len(log[sensor]) > 1:
             other = np.interp(log["mag"].time, log[sensor].time, compass_heading(log, config, sensor))

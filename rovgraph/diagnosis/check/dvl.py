@@ -1,6 +1,6 @@
 """The DVL against the IMU by their accelerations: axes, mounting, clock, and jumps of a clock.
 
-Nothing else is needed: no heading, no depth, no change of depth.
+The check needs neither heading nor depth.
 """
 
 from collections.abc import Iterator
@@ -18,10 +18,10 @@ from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors.dvl import axes_remedy
 
-SIMILAR = 1.1  # times the least error, that tells two orientations apart no more
+SIMILAR = 1.1  # times the least error, up to which two orientations are not distinguished
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 APART = 0.15  # that search and fit may be apart [s]
-TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
+TURNED = np.deg2rad(30.0)  # a large error of the mounting; steady circles confuse smaller ones with a lag
 
 
 def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> Iterator[Finding]:

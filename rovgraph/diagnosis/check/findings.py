@@ -1,4 +1,4 @@
-"""What a check has to say, and helpers that the checks share."""
+"""Findings of a check, and helpers that the checks share."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -44,7 +44,7 @@ class Finding:
 
     @property
     def of_clock(self) -> bool:
-        """Whether it says that a clock is late, early or set."""
+        """Whether it reports that a clock is late, early or set."""
         return self.kind in CLOCKS
 
 
@@ -76,7 +76,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Report:
-    """All that was found in a log.
+    """All findings in a log.
 
     Attributes
     ----------
@@ -94,12 +94,12 @@ class Report:
         return [f for f in self.findings if f.level == level]
 
     def faults(self, config: Config) -> list[Finding]:
-        """What is wrong with the data of sensors that an estimate uses."""
+        """Errors in the data of sensors that an estimate uses."""
         used = heading_sources(config, {t.sensor for t in self.timings})
         return [f for f in self.findings if f.wrong and (f.sensor in used or f.sensor not in HEADING_STREAMS)]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; what is not known is None."""
+        """For JSON; unknown values are None."""
         known: dict[str, Any] = _without_nan(asdict(self))
         for finding, written in zip(self.findings, known["findings"], strict=True):
             written["wrong"] = finding.wrong
@@ -125,7 +125,7 @@ def believed_lag(config: Config, late: str, than: str | None = None) -> tuple[fl
 
 
 def told(stream: Stream) -> Array:
-    """What a sensor measured, shape (n, k): NaN in pings without bottom lock, which hold nothing or a sentinel."""
+    """Measurements of a sensor, shape (n, k): NaN in pings without bottom lock, which are empty or hold a sentinel."""
     if stream.sensor != "dvl":
         return stream.data
     return np.where((stream["dvl_valid"] == 1.0)[:, None], stream.data, np.nan)
@@ -137,7 +137,7 @@ def valid_pings(stream: Stream) -> Stream:
 
 
 def without_spikes(stream: Stream) -> Stream:
-    """What is near the median of the five around it, in each of the first three columns."""
+    """Measurements near the median of the five around each, in each of the first three columns."""
     if len(stream) < 5:
         return stream
     padded = np.pad(stream.data[:, :3], ((2, 2), (0, 0)), mode="edge")

@@ -1,17 +1,15 @@
-"""The DVL's track, turned by a heading, against position fixes.
+"""Position fixes against the DVL's track, turned by a heading, and against the configured start.
 
 In the plane as complex numbers: a fix is ``p + c D(t - tau)`` with ``D`` the sum of ``exp(i psi) v dt``. ``arg c`` is
 the error of heading and mounting, ``|c|`` the scale, ``tau`` how late the fixes are, and ``p`` is free in each stretch
 of some minutes, since D drifts. Fixes of swapped north and east fit the conjugate of D; a DVL whose y axis is mirrored
-fits better with the conjugate velocity. A cause is named where it explains the fixes beyond what chance does.
+fits better with the conjugate velocity. A cause is named where it explains the fixes better than chance.
 
-The start that a configuration states, against the first position fixes.
+`start` compares the configured start with the first fixes. The vehicle cannot be further from its start than the
+distance that the DVL has measured since. Fixes of another origin, or turned by a wrong heading of the ship, begin
+somewhere else.
 
-The vehicle cannot be further from its start than the way that the DVL has measured since. Fixes of another origin, or
-turned by a wrong heading of the ship, begin somewhere else.
-
-A current that changes under a water track: water track against bottom track or fixes, one level against two.
-
+`current` finds a current that changes under a water track: against the bottom track or fixes, one level against two.
 The water's velocity over ground is that of the vehicle over ground less that through the water, c = v - v_w, turned
 into n by a compass. In means over blocks of some seconds waves hardly show.
 """
@@ -90,7 +88,7 @@ class _Tracks:
 
 
 def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | None:
-    """The DVL's track by the heading that tells most, or by one compass; None where something is missing."""
+    """The DVL's track by the heading that determines it best, or by one compass; None where something is missing."""
     if not {"dvl", "fix"} <= log.sensors:
         return None
     others = {name: s for name, s in log.streams.items() if compass in (None, name) or name not in OFFSETS}

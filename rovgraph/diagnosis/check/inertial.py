@@ -1,4 +1,4 @@
-"""The motion that the IMU alone shows, on even times: rates, level, and acceleration without gravity.
+"""Motion from the IMU alone, at even times: rates, level, and acceleration without gravity.
 
 The gyro gives the attitude relative to that at the start, ``R_gb``, which drifts slowly. There the mean specific force
 of some 20 s is gravity (upwards), since no vehicle accelerates for so long; it turns with the gyro's bias ``b``,
@@ -58,12 +58,12 @@ class InertialMotion:
         return np.asarray(np.sum(self.rate_b * self.down_b, axis=1))
 
     def at(self, times: Array, values: Array) -> Array:
-        """What is known at the even times (n, k), at others; shape (m, k)."""
+        """Values at the even times (n, k), interpolated to others; shape (m, k)."""
         return np.column_stack([np.interp(times, self.time, column) for column in values.T])
 
 
 def inertial_motion(log: Log, config: Config) -> InertialMotion | None:
-    """What the IMU shows; None where its log is too short."""
+    """Motion by the IMU; None where its log is too short."""
     if "imu" not in log or len(log["imu"]) < 3:
         return None
     imu = log["imu"]

@@ -1,12 +1,11 @@
-"""Lags and axes between sensors that show one motion: what all comparisons share.
+"""Lags and axes between sensors that measure one motion, for all comparisons.
 
-Cross-correlations of whole dives by FFT, the lag at which one is largest, the ways to name axes, and normal equations
-of the parts of a dive: leaving out one after the other shows how much a fit depends on it, without a model of what two
-sensors do not share.
+Cross-correlations of whole dives by FFT, the lag of the largest, the possible orders of axes, and normal equations
+of the parts of a dive: leaving out one after the other shows how much a fit depends on it, without a model of the
+errors that two sensors do not share.
 
-How much later one signal is than another, and their slope, by the changes of both within windows.
-
-The fit is ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
+`lag` finds how much later one signal is than another, and their slope, by the changes of both within windows. The fit
+is ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
 """
 
 from dataclasses import dataclass
@@ -174,7 +173,7 @@ def lag(a: Signal, b: Signal, window: float, coarse: float | None = None) -> Lag
     ``a``, the less noisy one, is moved along: b's noise is then the same at every lag, so that
     the correlation is a smooth function of it. The standard deviation comes from leaving out one
     part of the log after the other, which needs no model of what the two signals do not share.
-    ``coarse`` is what `coarse_lag` gives, where other signals tell it better.
+    ``coarse`` is the result of `coarse_lag`, where other signals determine it better.
     """
     step = 0.1
     lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
@@ -209,7 +208,7 @@ def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
 
 
 def _correlation(sums: Array) -> Array:
-    """Absolute correlation of sums (m, 6) as `_moments` gives them; shape (m,), 0 where there is none."""
+    """Absolute correlation of sums (m, 6) as `_moments` gives them; shape (m,), 0 without variation."""
     n, x, y, xx, yy, xy = sums.T
     spread = (n * xx - x * x) * (n * yy - y * y)
     return np.asarray(np.abs(n * xy - x * y) / np.sqrt(np.where(spread > 0.0, spread, np.inf)))

@@ -1,7 +1,4 @@
-"""Whether the values of each sensor are possible: gravity, units, ranges, bottom lock.
-
-Measurements that are none although the vehicle moves: what an estimate leaves out.
-"""
+"""Values of each sensor by itself: gravity, units, ranges, bottom lock, and invalid measurements."""
 
 from collections.abc import Iterator, Sequence
 
@@ -110,7 +107,7 @@ def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
 
 
 def angles(log: Log, config: Config) -> Iterator[Finding]:
-    """Roll and pitch that are no radians; headings are compared with the gyro elsewhere."""
+    """Roll and pitch that are not in radians; headings are compared with the gyro elsewhere."""
     if "ahrs" not in log:
         return
     tilt = np.abs(log["ahrs"].data[:, 1:])
@@ -189,7 +186,7 @@ def _piled_up(values: Array, data: Array) -> NDArray[np.int64]:
 
 
 def _like_a_range(name: str, limit: float) -> str:
-    """The usual range that a limit is, in brackets; "" if it is none."""
+    """The usual range with this limit, in brackets; "" without one."""
     unit, size = ("g", STANDARD_GRAVITY) if name == "acc" else ("deg/s", float(np.deg2rad(1.0)))
     near = [a for a in RANGES[name] if abs(limit / size - a) < LIKE_A_RANGE * a]
     return f" ({near[0]:g} {unit})" if near else ""
@@ -211,7 +208,7 @@ LOST_BOTTOM = "log pings without bottom lock with dvl_valid 0"
 
 
 def standstill(log: Log, config: Config, frozen: Sequence[FrozenStretch] | None = None) -> Iterator[Finding]:
-    """What of each sensor is none, a line for each kind; ``frozen`` is that of the log, where it is known."""
+    """Invalid measurements of each sensor, a line for each kind; ``frozen`` is that of the log, where it is known."""
     kinds: dict[tuple[str, str], list[FrozenStretch]] = {}
     for stretch in frozen_stretches(log, config) if frozen is None else frozen:
         kinds.setdefault((stretch.sensor, stretch.kind), []).append(stretch)

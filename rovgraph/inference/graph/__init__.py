@@ -1,6 +1,8 @@
-"""The factor graph: the only place that touches GTSAM graphs, factors and solvers.
+"""The factor graph in GTSAM: the only package that imports gtsam.
 
-docs/architecture.md says which module does what.
+May import the rest of `rovgraph.inference` and what is below. Begin with `batch` (a dive as a graph, solved by
+Gauss-Newton), then `optimum` (its covariances), `places` (association of landmarks), `isam2` (the incremental graph)
+and `values` (GTSAM's `Values` to and from a `State`).
 """
 
 from rovgraph.errors import InputError

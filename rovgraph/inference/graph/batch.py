@@ -1,18 +1,11 @@
-"""A dive as GTSAM's graph, solved by Gauss-Newton: where loops are closed, and to hold the chain against.
+"""A dive as GTSAM's graph, solved by Gauss-Newton: for closed loops, and as a reference for the chain.
 
-Each iteration linearises GTSAM's own factors there, and all measurements of a sensor at once; GTSAM eliminates the
-sum. Calibration that walks has a value at each keyframe, as in the chain.
-
-Priors and walks as lists of factors.
-
-Measurements as GTSAM's nonlinear factors, whose callbacks linearise the same `Measurements` as the chain does.
-
-The IMU's motion over an interval as a factor between its keyframes.
-
-The measurements of all sensors as Jacobian factors, one for each keyframe, and one for each place that it sees.
-
-Making a factor costs Python and GTSAM more than the numbers in it, and eliminating many
-small ones more than few; a keyframe has one for each of its sensors, or all in one.
+Priors, walks, the IMU's motion over each interval and all measurements become factors. Each iteration linearises
+GTSAM's own factors there, and all measurements of a sensor at once, as Jacobian factors; GTSAM eliminates the sum.
+There is one such factor for each keyframe, with the rows of all its sensors, and one for each place that it observes:
+making a factor costs Python and GTSAM more than its numbers do, and eliminating many small ones more than few.
+`custom_factor` gives the same measurements as GTSAM's nonlinear factors, whose callbacks linearise the `Measurements`
+that the chain uses. Calibration that walks has a value at each keyframe, as in the chain.
 """
 
 import re
@@ -86,7 +79,7 @@ def priors(prior: StatePrior, beliefs: Mapping[str, Belief], unknowns: Calibrati
 
 
 def landmark_prior(number: int) -> Factor:
-    """The prior of a place: it says next to nothing, and determines a place that all gates have shut out."""
+    """The prior of a place: so wide that it only determines a place all of whose sightings are rejected."""
     return gtsam.PriorFactorVector(
         key(PLACE, number), np.zeros(PLACE_DIM), gtsam.noiseModel.Isotropic.Sigma(PLACE_DIM, ANYWHERE_M)
     )
@@ -192,7 +185,7 @@ def preintegrated(motion: Array, steps: Array) -> gtsam.PreintegratedCombinedMea
 
 
 def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Mapping[str, int]) -> gtsam.CustomFactor:
-    """The residual of `rovgraph.kernels.motion_residual` as a factor, which knows the IMU's scales.
+    """The residual of `rovgraph.kernels.motion_residual` as a factor, with the IMU's scales.
 
     Parameters
     ----------

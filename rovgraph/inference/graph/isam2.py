@@ -1,36 +1,29 @@
 """iSAM2 over a whole dive: an incremental graph that is a filter at its newest keyframe and a smoother behind it.
 
 Each interval is predicted with the IMU from the graph's own newest keyframe, and measurements are gated by their
-innovations against the graph's own joint covariance there (`FilterEngine.step`, from what iSAM2 knows); what was let
-in becomes a factor, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
-are smoothed: the smoother's Gauss-Newton goes on from iSAM2's estimate until it rests.
+innovations against the graph's own joint covariance there (`FilterEngine.step`, with iSAM2's covariance); admitted
+measurements become a factor, and after the update the newest keyframe is the filtered estimate. In the end all
+keyframes are smoothed: the smoother's Gauss-Newton continues from iSAM2's estimate until it converges.
 
-Factors that were linearised at different headings and mountings claim to know what nothing has shown (Huang,
-Mourikis and Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation.
-Where attitude or calibration are off by a part of their sd, all is relinearised from there on. A constant that all
-keyframes share would make every update touch the whole tree, so each constant of the calibration is a row of nearly
-equal ones, one for each segment of time.
-
-The intervals of a dive as whitened rows about a point, which can be linearised again when the point has moved.
-
-With the errors e_i, e_j of the keyframes before and after an interval and e_c of the calibration, in the order of
-`rovgraph.inference.filter`, an interval says
+`Linearization` holds the intervals of a dive as whitened rows about a point. With the errors e_i, e_j of the keyframes
+before and after an interval and e_c of the calibration, in the order of `rovgraph.inference.filter`, the rows are
 
     A_i e_i + A_j e_j + C e_c = r + white noise
 
-in one row for each component of its motion, or of the prior, and of the measurements since the keyframe before.
-Their equations are the compiled ones, and losses weight the rows.
+one for each component of its motion, or of the prior, and of the measurements since the keyframe before. Their
+equations are the compiled ones, and losses weight the rows.
 
-Incremental smoothing over a whole dive: iSAM2 (Kaess et al. 2012) of a linearised graph.
+`Incremental` is iSAM2 (Kaess et al. 2012) of that linearised graph. Its variables are errors about the point: one for
+each keyframe, one for the calibration of each segment of time, and one for each place. An interval is one factor,
+linearised in compiled code, so that an update needs no callback and eliminates two cliques. Elimination is by QR, as
+Cholesky squares the rows of precise motions. A constant that all keyframes share would make every update touch the
+whole tree, so each segment has its own, tied to the one before by a walk of nearly zero sd.
 
-iSAM2 holds the errors about a point: one variable for each keyframe, one for the calibration of each segment of
-time, and one for each place. An interval is one factor, linearised by the compiled equations
-(`rovgraph.inference.graph.isam2`), so that an update calls nothing back and eliminates two cliques. iSAM2 does not
-relinearise by itself: `relinearize` moves the point to the estimate from some segment on and replaces the factors
-from there, which is the part of the Bayes tree that a change of these variables would take up anyway.
-
-By QR, as Cholesky squares the rows of precise motions. A constant that all keyframes share would make every update
-touch the whole tree, so each segment has its own, tied to the one before by a walk that hardly moves.
+Factors that were linearised at different headings and mountings bring spurious information (Huang, Mourikis and
+Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation. Where attitude or
+calibration are off by a part of their sd, `relinearize` moves the point to the estimate from some segment on and
+replaces the factors from there, which is the part of the Bayes tree that a change of these variables affects anyway.
+iSAM2 does not relinearise by itself.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -88,7 +81,7 @@ class KeyframeTerms:
 
     Parameters
     ----------
-    filter : knows their equations
+    filter : with their equations
     problem, index : the dive, and which of its measurements; at least one
     """
 
@@ -111,11 +104,11 @@ class KeyframeTerms:
 
 
 class IntervalTerms:
-    """An interval with what was let in of its measurements, to be linearised at any point.
+    """An interval with its admitted measurements, which can be linearised at any point.
 
     Parameters
     ----------
-    filter : knows the equations
+    filter : with the equations
     problem, k : the interval that ends with keyframe k
     let_in : ndarray of int, its measurements that count
 
@@ -146,7 +139,7 @@ class Linearization:
 
     Parameters
     ----------
-    filter : knows the layout of the error
+    filter : with the layout of the error
     prior : of the first keyframe
     """
 
@@ -237,7 +230,7 @@ class Incremental:
 
     Parameters
     ----------
-    filter : knows equations, prior and the layout of the error
+    filter : with equations, prior and the layout of the error
     beliefs : of the calibration, all of which walks
 
     Attributes
@@ -379,7 +372,7 @@ class Incremental:
         self._replace(segment)
 
     def restart(self, problem: Problem, let_in: Gates, x: Array, c: Array) -> None:
-        """Go on from another point, and with other measurements.
+        """Continue from another point, and with other measurements.
 
         Parameters
         ----------
@@ -437,7 +430,7 @@ class Incremental:
             self._owners += [index] * len(factors)
 
     def _insert(self, name: int, dim: int) -> None:
-        """A variable that iSAM2 does not know yet; the error is zero at the point."""
+        """A new variable of iSAM2; the error is zero at the point."""
         if not self._engine.valueExists(name):
             self._values.insert(name, np.zeros(dim))
 
@@ -494,7 +487,7 @@ def moved(x: Array, delta: Array) -> Array:
     return out
 
 
-UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
+UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where not every keyframe is needed
 # since the start, when the dive so far is solved with all its measurements: a gate may have been wrong before [s]
 OPTIMUM_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)
 CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
@@ -559,14 +552,14 @@ class IncrementalEstimator:
         return made
 
     def step(self, problem: Problem, k: int) -> FilterStep:
-        """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
+        """Take an interval: predicted and gated from iSAM2's estimate of the keyframe before, then added."""
         done = self.filter.step(problem, k, self.known, self.gates)
         self.take(problem, k, done.filtered, done.met)
         self.history.append(self.known, done.met)
         return done
 
     def take(self, problem: Problem, k: int, known: Gaussian, met: Met) -> None:
-        """Take a keyframe with what of its measurements was let in.
+        """Take a keyframe with its admitted measurements.
 
         Parameters
         ----------
@@ -582,7 +575,7 @@ class IncrementalEstimator:
             self.update()
 
     def update(self) -> None:
-        """Have iSAM2 take what has come since; the filter goes on from its newest keyframe."""
+        """Update iSAM2 with the intervals since; the filter continues from its newest keyframe."""
         if self.updated == self._count - 1:
             return
         self.engine.update()
@@ -608,7 +601,7 @@ class IncrementalEstimator:
             self._know()
 
     def _restart(self) -> None:
-        """Go on from the optimum of the dive so far, with what it lets in."""
+        """Continue from the optimum of the dive so far, with its admitted measurements."""
         best = self._optimum()
         n, state = self._count, best.state
         calibration = {name: np.broadcast_to(value, (n, value.shape[-1])) for name, value in state.calibration.items()}
@@ -633,7 +626,7 @@ class IncrementalEstimator:
         return states_of(*self.engine.estimate())
 
     def filtered(self) -> Estimate:
-        """What was known of each keyframe when it was the newest."""
+        """The filtered estimate of each keyframe, from when it was the newest."""
         return self.history.estimate(self.problem, "filtered")
 
     def solve(self) -> Estimate:
@@ -646,7 +639,7 @@ class IncrementalEstimator:
         return self._optimum()
 
     def _optimum(self) -> Optimum:
-        """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
+        """The dive so far, solved from iSAM2's estimate; a landmark beyond its gate there gets a place of its own."""
         states, problem = self.states(), self.problem.upto(self._count)
         given = self.initial, states, newest_calibration(states.calibration)
         seen = problem.of_sensor(PLACE)
@@ -674,7 +667,7 @@ def run_isam2(
     update_s: float = 0.0,
     searches: Searches | None = None,
 ) -> IncrementalEstimator:
-    """iSAM2 that has taken the keyframes of a dive; ``progress`` is told 0 to 1 now and then."""
+    """iSAM2 that has taken the keyframes of a dive; ``progress`` receives 0 to 1 now and then."""
     estimator = IncrementalEstimator(initial, update_s, searches)
     for k in range(len(problem)):
         estimator.step(problem, k)

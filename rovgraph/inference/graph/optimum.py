@@ -1,13 +1,9 @@
-"""The optimum of a graph, as `rovgraph.inference.optimum` asks of any solver.
+"""The optimum of a graph and its covariances, with the interface of `rovgraph.inference.optimum`.
 
-What the data up to a time say of the calibration, from the graph's own information matrix.
-
-The dive is eliminated piece by piece in the order of time, by QR. What is left of a piece are
-conditionals of its last keyframe and of the calibration; they go into the next piece as factors.
-So every piece ends with the exact joint covariance given all data so far, every factor
-linearised at the same values, and the whole costs one elimination.
-
-How certain the optimum of a dive is: marginal covariances from its Bayes tree.
+Marginal covariances come from the Bayes tree. `knowledge` gives the information that the data up to a time hold about
+the calibration: the dive is eliminated piece by piece in the order of time, by QR. From each piece remain conditionals
+of its last keyframe and of the calibration, which are factors of the next piece. So every piece ends with the exact
+joint covariance given all data so far, every factor linearised at the same values, and the whole costs one elimination.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +29,7 @@ from rovgraph.problem.problem import Problem
 
 
 def knowledge(graph: DiveGraph, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
-    """What is known from the data up to each of some keyframes.
+    """Estimates of the calibration from the data up to each of some keyframes.
 
     Parameters
     ----------
@@ -76,7 +72,7 @@ def eliminate(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> tuple[g
 
 
 def noise_of_states(graph: DiveGraph, values: gtsam.Values, gates: Gates, seed: int = 1) -> gtsam.VectorValues:
-    """A draw of the error that the data's noise leaves in the states, calibration held.
+    """A draw of the states' error from their posterior, calibration held.
 
     Parameters
     ----------
@@ -93,7 +89,7 @@ def noise_of_states(graph: DiveGraph, values: gtsam.Values, gates: Gates, seed: 
 
 
 def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Sequence[str]) -> dict[int, Array]:
-    """How the optimum of all else moves with calibration variables that are given.
+    """Derivative of the optimum of all else by given calibration variables.
 
     Parameters
     ----------
@@ -113,7 +109,7 @@ def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Seq
         order.push_back(one)
     R, ends = root.jacobian(order)[0], np.cumsum([net.at(i).rows() for i in range(others, net.size())])[:-1]
     columns: dict[int, list[Array]] = {net.at(i).firstFrontalKey(): [] for i in range(others)}
-    for unit in R.T:  # what the given variables' own rows say where one component is 1, all others 0
+    for unit in R.T:  # the given variables' own rows where one component is 1, all others 0
         rhs = gtsam.VectorValues()
         for i in range(others):
             rhs.insert(net.at(i).firstFrontalKey(), np.zeros(net.at(i).rows()))
@@ -280,7 +276,7 @@ class GraphOptimum:
 
     @cached_property
     def _sensitivity(self) -> dict[int, Array]:
-        """Derivatives of the optimum by what is considered times its prior sd, by key, shape (dim, h)."""
+        """Derivatives of the optimum by considered variables times their prior sd, by key, shape (dim, h)."""
         moves = sensitivity(*self._wide, self.solution.gates, self.unknowns.considered)
         beliefs = [self.beliefs[name] for name in self.unknowns.considered]
         sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])

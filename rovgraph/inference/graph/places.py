@@ -1,19 +1,17 @@
-"""Which landmarks of a name are of one place.
+"""Association of landmarks: which sightings of one name belong to one place.
 
-A camera that takes one rock for another would tie two spots together, and a robust loss does
-not help: between two landmarks lie minutes of drift, known to metres only, so the track follows
-a false match and leaves no residual. What tells one is that the vehicle cannot have been there,
-as long as the match is not believed yet. So the dive is solved without places first. That gives
-the joint covariance of where the vehicle was at every landmark, and in the order of time each
-landmark is compared with the places of its name: the innovation squared over its covariance
-(NIS) decides, as it does in the filter. One that fits no place of its name begins another; a
-place that is seen once says nothing, so a false first landmark spoils none of those that
-follow. Each that is accepted narrows the joint covariance for the next (joint compatibility,
-Neira and Tardos 2001, one landmark at a time).
+A camera that mistakes one rock for another would tie two spots together, and a robust loss does not help: minutes of
+drift lie between two sightings, known to metres only, so the track follows a false match and leaves no residual. A
+false match shows only against a track that does not use it. So the dive is solved without places first. That gives
+the joint covariance of the vehicle's positions at all sightings, and in the order of time each sighting is compared
+with the places of its name: the innovation squared over its covariance (NIS) decides, as it does in the filter. A
+sighting that fits no place of its name begins another place. A place seen once adds no information, so a false first
+sighting does not harm the following ones. Each accepted sighting narrows the joint covariance for the next (joint
+compatibility, Neira and Tardos 2001, one landmark at a time).
 
-In the end the place of a name is the one that most of its landmarks agree on, and those that agree
-with nothing else are kept as landmarks of it that are not believed: `rovgraph.inference.graph.batch` begins
-without them, and lets them in if its optimum finds them within their gate after all.
+In the end the place of a name is the one that most of its sightings agree on. Sightings that agree with no other start
+as rejected ones of that place: `rovgraph.inference.graph.batch` begins without them, and admits them if they lie within
+their gate at its optimum.
 """
 
 from collections import Counter

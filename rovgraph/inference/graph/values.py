@@ -53,7 +53,7 @@ def key_index(key: int) -> tuple[bool, int]:
 
 
 def key_name(key: int) -> str:
-    """What a key stands for, in words: for messages."""
+    """A key in words, for messages."""
     letter, index = divmod(key, _INDICES)
     variable = _variable(letter)
     if variable == PLACE:

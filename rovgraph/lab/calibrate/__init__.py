@@ -1,7 +1,8 @@
 """Calibrations made from a log of their own: the magnetometer turned by hand, sensors at rest.
 
-`calibrate_magnetometer` and `calibrate_noise` do the work of ``rovgraph calibrate``. Each returns what was
-found, and the piece of configuration that follows from it.
+`calibrate_magnetometer` and `calibrate_noise` do the work of ``rovgraph calibrate``. Each returns its results and the
+piece of configuration that follows from them. May import what `rovgraph.lab` may. Begin with `magnetometer` and
+`noise`, whose docstrings have the equations.
 """
 
 from rovgraph.lab.calibrate.magnetometer import METHODS, MagnetometerCalibration, Method, calibrate_magnetometer

@@ -1,6 +1,6 @@
 """Changes of the magnetic field that belong to the vehicle: something magnetic was attached or removed.
 
-Over seconds a gyro knows how the vehicle turned, R(t) from its axes to those of the beginning, so
+Over seconds the gyro gives the vehicle's rotation R(t) from its axes to those of the beginning, so
 
     y(t) = R(t)^T h + b(t)
 
@@ -184,7 +184,7 @@ def _step_statistics(bins: Bins, half: int) -> tuple[Array, Array, Array]:
     whole, right = P[high] - P[low], P[high] - P[mid]
     N[:, :6, :6], N[:, 6:, :6], N[:, :6, 6:], N[:, 6:, 6:] = whole, right[:, 3:], right[:, :, 3:], right[:, 3:, 3:]
     y = np.concatenate([q[high] - q[low], (q[high] - q[mid])[:, 3:]], axis=1)
-    N += 1e-6 * half * np.eye(9)  # at rest h and b are not told apart; the step is
+    N += 1e-6 * half * np.eye(9)  # at rest h and b cannot be separated; the step is
     inverse = np.linalg.inv(N)
     x, without = np.einsum("nij,nj->ni", inverse, y), np.linalg.solve(N[:, :6, :6], y[:, :6, None])[..., 0]
     left = np.maximum(squares[high] - squares[low] - np.einsum("ni,ni->n", x, y), 0.0)
@@ -244,7 +244,7 @@ def _drift_prior(nodes: int, count: int, length: float) -> Any:
 
 
 def _own_sd(bins: Bins, edges: NDArray[np.int64], length: float) -> Array:
-    """How well each stretch by itself tells h from b, as an sd of b; shape (k,). At rest it does not."""
+    """How well each stretch by itself separates h from b, as an sd of b; shape (k,). At rest it does not."""
     out = np.empty(len(edges) - 1)
     for k, (low, high) in enumerate(pairwise(edges)):
         mean = bins.R_t[low:high].mean(axis=0)
@@ -256,13 +256,13 @@ def _own_sd(bins: Bins, edges: NDArray[np.int64], length: float) -> Array:
 def _kinds(offset: Array, own_sd: Array, lasting: NDArray[np.int64], least: float, most: float) -> NDArray[np.int64]:
     """Which stretches share an offset: 0 the one that holds longest, others counted in the order of time.
 
-    Stretches that say little about their own offset (at rest) count as different only when
+    Stretches that hardly determine their own offset (at rest) count as different only when
     they differ by ``most``.
     """
     tolerance = np.clip(3.0 * np.hypot(own_sd[:, None], own_sd[None]), least, most)
     near = np.linalg.norm(offset[:, None] - offset[None], axis=2) < tolerance
     sure = 3.0 * own_sd <= most
-    usual = near[int(np.argmax((near @ lasting) * sure))]  # a stretch that says little is near to all
+    usual = near[int(np.argmax((near @ lasting) * sure))]  # an uncertain stretch is near to all
     kind, count = np.zeros(len(offset), dtype=np.int64), 0
     for i in np.flatnonzero(~usual):
         goes_on = i > 0 and not usual[i - 1] and near[i, i - 1]
@@ -274,7 +274,7 @@ def _kinds(offset: Array, own_sd: Array, lasting: NDArray[np.int64], least: floa
 def _reach(time: Array, off: NDArray[np.bool_], edge: int, side: int) -> float:
     """How far a disturbance reaches across its edge, before it (side -1) or after it (1) [s].
 
-    ``off`` says where the field is not that of the neighbouring stretch. A transition may
+    ``off`` marks where the field is not that of the neighbouring stretch. A transition may
     take as long as half a window; shorter returns in between belong to it.
     """
     if edge in (0, len(time)):

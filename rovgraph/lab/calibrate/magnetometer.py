@@ -1,4 +1,4 @@
-"""Calibration of a magnetometer from a log in which the vehicle was turned.
+"""Calibration of a magnetometer from a log in which the vehicle was turned: by an ellipsoid, or as in the thesis.
 
     field = matrix (sample - centre)
 
@@ -6,16 +6,16 @@ in IMU axes: hard iron and soft iron, (3.2) with a full matrix where the method 
 the log's: the determinant of the matrix is 1, or the field gets the length
 ``environment.field_norm`` where the configuration gives it.
 
-The ellipsoid that magnetometer samples lie on when the vehicle is turned through all directions.
+**Ellipsoid.** Turned through all directions, magnetometer samples y lie on
 
     |M (y - c)| = 1
 
 c is the hard iron, M, symmetric, soft iron and scale: (3.2) with a full matrix. The fit is least squares
 on the field's length, which are the units of the error, with a robust loss; it begins at the
 sphere that linear least squares give. A rotation between magnetometer and IMU does not change lengths,
-so it cannot be seen here.
+so it cannot be observed here.
 
-The thesis's calibration of the magnetometer: a turn about z and a turn about x (3.2)-(3.9).
+**Thesis**: a turn about z and a turn about x (3.2)-(3.9).
 
     H = gamma y + kappa,    gamma diagonal
 
@@ -320,7 +320,7 @@ class SphereFit:
 
 @dataclass(frozen=True)
 class MagnetometerCalibration:
-    """What a calibration found.
+    """Result of a magnetometer's calibration.
 
     Attributes
     ----------
@@ -367,7 +367,7 @@ class MagnetometerCalibration:
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader of the piece should know, a line each."""
+        """Remarks for a reader of the piece, a line each."""
         before, after = 100.0 * self.before.length_rms, 100.0 * self.after.length_rms
         fit = f"scatter of the field's length {before:.2f} % of it, now {after:.2f} %"
         return [f"magnetometer calibrated from {self.source}, method {self.method}", fit]
@@ -375,7 +375,7 @@ class MagnetometerCalibration:
 
 @dataclass(frozen=True)
 class _Shape:
-    """Centre, matrix of any scale, and what else a method says."""
+    """Centre, matrix of any scale, and other results of a method."""
 
     centre: Array
     matrix: Array

@@ -1,10 +1,10 @@
 """Noise of sensors from a log at rest: covariance, spectrum, Allan deviation (3.1.4, 3.2.2, appendix A).
 
-What follows for the configuration is the piece of `NoiseReport`: densities and walks of the IMU
-from the Allan deviation with lines and waves taken out, standard deviations of what comes slower as the
-scatter without them. What the log is too short to show is left out, and said.
+`NoiseReport` holds the piece of configuration: densities and walks of the IMU from the Allan deviation with lines and
+waves removed, standard deviations of slower sensors as the scatter without them. Values that the log is too short for
+are left out and listed.
 
-Allan deviation and what is read off it.
+**Allan deviation**
 
     sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3
 
@@ -12,16 +12,12 @@ N is the noise density (angle or velocity random walk), B the bias instability, 
 bias (IEEE Std 952, annex C). The three are fitted at once, none below zero, each point weighted by
 how well a log of that length determines it. `allantools` computes the deviation.
 
-Power spectral density of sensors at rest, and the lines in it (3.1.4).
+**Power spectral density** and the lines in it (3.1.4). Regular samples by Welch's method, irregular ones (a DVL's
+pings) by Lomb and Scargle's periodogram, averaged over half-overlapping tapered segments alike. A line exceeds the
+running median around it by more than chance gives.
 
-Regular samples by Welch's method, irregular ones (a DVL's pings) by Lomb and Scargle's periodogram,
-averaged over half-overlapping tapered segments alike. A line stands out of the running median around it
-by more than chance gives.
-
-Does a log stand still? Waves do not count as motion.
-
-Signals are averaged under a Hann window of `WINDOW_S`, which takes an oscillation of waves
-(0.34 Hz in the thesis's lake, 3.1.4) down to a thousandth and leaves turning, tilting, driving.
+**Standing still.** Waves do not count as motion: signals are averaged under a Hann window of `WINDOW_S`, which reduces
+an oscillation of waves (0.34 Hz in the thesis's lake, 3.1.4) to a thousandth and leaves turning, tilting, driving.
 """
 
 from collections.abc import Iterator, Mapping
@@ -279,7 +275,7 @@ def _background(frequency: Array, density: Array) -> Array:
 
 
 def _running_median(level: Array, width: int) -> Array:
-    """Median over ``width`` values; a slope (of a walk) goes on below the first, what is above the last is like it."""
+    """Median over ``width`` values; a slope (of a walk) continues below the first; above the last it is constant."""
     half = min(width // 2, len(level) - 1)
     padded = np.pad(np.pad(level, (half, 0), mode="reflect", reflect_type="odd"), (0, half), mode="symmetric")
     return np.asarray(median_filter(padded, size=2 * half + 1)[half : len(padded) - half])
@@ -344,7 +340,7 @@ def require_still(log: Log) -> None:
 
     Raises
     ------
-    InputError : says which sensor shows it, when and how much
+    InputError : names the sensor that shows it, when and how much
     """
     for watch in _WATCHES:
         if watch.sensor in log and not (watch.angle and "imu" in log):
@@ -443,7 +439,7 @@ class Peak:
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """What a log at rest says about its sensors.
+    """Noise of sensors from a log at rest.
 
     Attributes
     ----------
@@ -454,7 +450,7 @@ class NoiseReport:
         components, and ndarray, shape (k, k) [products of the channels' units]
     peaks : strongest first within a sensor
     piece : keys of a configuration
-    remarks : what the log could not say, a sentence each
+    remarks : what the log could not determine, a sentence each
     """
 
     source: str

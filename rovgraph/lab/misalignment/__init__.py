@@ -1,6 +1,7 @@
-"""Monte Carlo of what can be known of the DVL's misalignment: what ``rovgraph study misalignment`` does.
+"""Monte Carlo study of the DVL's misalignment: the work of ``rovgraph study misalignment``.
 
-`read_study` reads what is to be studied, `study` runs it. docs/studies.md describes both.
+May import what `rovgraph.lab` may. Begin with `plan` (`read_study`: the cells of a study), then `run` (one run of a
+cell) and `results` (`study` runs all). docs/studies.md describes the use.
 """
 
 from rovgraph.lab.misalignment.plan import Cell, Study, chosen, read_study

@@ -1,8 +1,6 @@
-"""What is to be studied: a YAML file of cells, mostly as the product of lists.
+"""The plan of a study: a YAML file of cells, mostly as the product of lists, and the vehicle of each cell.
 
-The vehicle of a cell: what an estimator believes, and what is so.
-
-Grades of inertial units, noise densities per root hertz:
+A cell has the estimator's configuration and the true values. Grades of inertial units, noise densities per root hertz:
 
 - mti: Xsens MTi, the figures of ``rovgraph/config/falcon.yaml`` (thesis, appendix A; data sheet for the biases).
 - tactical: Sensonor STIM300 by its data sheet: 0.15 deg/rt(h), 0.06 m/s/rt(h), on-off bias of the
@@ -62,7 +60,7 @@ GRADES: Mapping[str, dict[str, Any]] = MappingProxyType(
 )  # fmt: skip
 
 COMPASS = MappingProxyType({"mag": "mag", "dvl": "dvl_compass", "ahrs": "ahrs"})  # source: prefix of its variables
-IRON = ("hard_iron", "soft_iron")  # a study's compasses err as said, and not otherwise
+IRON = ("hard_iron", "soft_iron")  # a study's compasses err only as stated
 
 
 def believed(
@@ -74,7 +72,7 @@ def believed(
     fix_sd_m: float | None,
     prior_deg: tuple[float, float],
 ) -> Config:
-    """What the estimator of a run is given; the simulator draws the errors of its compasses from it.
+    """The configuration for the estimator of a run; the simulator draws the errors of its compasses from it.
 
     Parameters
     ----------
@@ -82,7 +80,7 @@ def believed(
     grade : key of `GRADES`
     headings : sources of heading
     heading_error, heading_error_sd_deg : what is unknown of each, and sd of every component
-    fix_sd_m : noise of a position fix, None = there are none
+    fix_sd_m : noise of a position fix, None = no fixes
     prior_deg : mean, beyond the mounting, and sd of the DVL's yaw
     """
     sources = tuple(headings.split("+"))
@@ -165,7 +163,7 @@ Grid: type[BaseModel] = create_model(
 
 
 class Study(ConfigSection):
-    """A study of the misalignment; the cells are the product of the grid's lists, and those told one by one."""
+    """A study of the misalignment; the cells are the product of the grid's lists, and those listed one by one."""
 
     name: str = Field("study", description="of tables and figures")
     seed: Annotated[int, Field(ge=0)] = Field(1, description="of the study; another one makes other dives")
@@ -195,7 +193,7 @@ class Study(ConfigSection):
         return [name for name in Cell.model_fields if len({getattr(cell, name) for cell in cells}) > 1]
 
     def to_yaml(self) -> str:
-        """As it was told, with the effective vehicle."""
+        """As it was given, with the effective vehicle."""
         own = {"name": self.name, "seed": self.seed, "runs": self.runs}
         told = self.model_dump(mode="json", exclude_unset=True)
         return yaml_text(own | told | {"vehicle": self.vehicle.model_dump(mode="json")})

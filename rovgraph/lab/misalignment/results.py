@@ -1,12 +1,9 @@
-"""Run a study, or what is left of it.
+"""The results of a study: runs, or what is left of them; their rows on disk; and a row per cell.
 
-From a row per run to a row per cell: is what an estimator says of its error true?
-
-The error of N independent runs with the right sd has a mean NEES (error / sd squared, one component)
-that is chi-square with N degrees of freedom over N (Bar-Shalom et al. 2001, 5.4.2), and the
-number of runs within their 95 % interval is binomial.
-
-The rows of a study on disk, as they come: what an interrupted study goes on from.
+`Ledger` keeps the rows as they come, so that an interrupted study continues. `cell_table` compares the estimator's sds
+with its errors. The error of N independent runs with the right sd has a mean NEES (error / sd squared, one component)
+that is chi-square with N degrees of freedom over N (Bar-Shalom et al. 2001, 5.4.2), and the number of runs within their
+95 % interval is binomial.
 """
 
 import contextlib
@@ -153,7 +150,7 @@ class Ledger:
 
 @contextlib.contextmanager
 def kept_so_far(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into an `InputError` that says how to go on."""
+    """Turn an error of the file system into an `InputError` that states how to continue."""
     try:
         yield
     except OSError as error:
@@ -167,7 +164,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Tables:
-    """What a study found; docs/studies.md describes the columns.
+    """Results of a study; docs/studies.md describes the columns.
 
     Attributes
     ----------
@@ -195,7 +192,7 @@ class Results:
         self.history = Ledger(folder / "history.csv", HISTORY_COLUMNS, ["cell", "run", "time_s"])
 
     def add(self, task: CellTask, result: Done | BaseException) -> None:
-        """Keep what came of a run; its own row comes last, so that a run with a row is whole."""
+        """Keep the results of a run; its own row comes last, so that a run with a row is complete."""
         if isinstance(result, BaseException):
             result = Done({**task.begun, "failure": in_one_line(result)}, [])
         self.history.add(result.history)

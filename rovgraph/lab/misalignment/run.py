@@ -1,4 +1,4 @@
-"""One run of a cell: simulate a dive, estimate it, and say what came of the misalignment."""
+"""One run of a cell: simulates a dive, estimates it, and returns the error of the misalignment."""
 
 import math
 import time
@@ -57,7 +57,7 @@ class CellTask:
 
     @property
     def begun(self) -> dict[str, Any]:
-        """What its row says before anything was done."""
+        """The entries of its row before the run."""
         return {"cell": self.cell.id, "run": self.run, "seed": self.seed, **self.cell.model_dump()}
 
 
@@ -70,7 +70,7 @@ class Done:
 
 
 def one_run(task: CellTask) -> Done:
-    """Simulate, estimate, and measure; an estimator that fails has a row that says why.
+    """Simulate, estimate, and measure; an estimator that fails has a row with the reason.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class _Run:
         return Done({**row, **numbers, **reached}, history)
 
     def _dive(self) -> tuple[Dive, Config]:
-        """The dive, and the configuration that its estimator may know."""
+        """The dive, and the configuration for its estimator."""
         cell = self.task.cell
         prior = (self.prior_mean_deg, cell.prior_sd_deg)
         errors = (cell.heading_error, cell.heading_error_sd_deg)
@@ -147,7 +147,7 @@ class _Run:
         return asked
 
     def _numbers(self, estimate: Estimate, dive: Dive) -> dict[str, Any]:
-        """What the estimate says of the misalignment, against the truth."""
+        """The estimated misalignment against the truth."""
         entry: CalibrationEstimate = next(c for c in estimate.calibration if c.label == "dvl_yaw")
         error, sd = (math.degrees(x) for x in (float(wrap_angle(entry.value - self.true_yaw)), entry.sd))
         if not (math.isfinite(error) and sd > 0.0):

@@ -1,10 +1,10 @@
 """The extended Kalman filters of the thesis, selectable by name.
 
-`FILTERS` lists them by section; `run_filter` runs one over a log, `run_filters` many, those
-of one kind side by side. One recursion (`recursion`, arithmetic in `core`) serves all: a filter is its process model
-(`processes`), what it measures (`mti`, `dvl`), what it takes as given (`known`), and its
-numbers (`variants`). Frames and axes are this package's, the numbers are converted; the
-motion is the same.
+May import what `rovgraph.lab` may. Begin with `variants`: `FILTERS` lists the filters by section of the thesis. `run`
+takes one (`run_filter`) or many (`run_filters`, those of one kind side by side) over a log. One recursion (`recursion`,
+arithmetic in `core`) serves all: a filter is its process model (`processes`), its measurements (`measurements`), its
+given attitude (`processes.known_motion`), and its numbers (`variants`). Frames and axes are this package's, the numbers
+are converted; the motion is the same.
 """
 
 from rovgraph.lab.thesis.run import FilterJob, run_filter, run_filters

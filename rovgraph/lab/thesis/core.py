@@ -1,9 +1,9 @@
-"""A model and the update of a Kalman filter, of several side by side.
+"""The common parts of the thesis's filters: models, the Kalman update, quaternions, and rows of many epochs.
 
 The arithmetic is that of `rovgraph.kernels.thesis_filters`. A leading axis, where there is one, is that of filters
-side by side. What comes out of one does not depend on the others, to the last bit.
+side by side. The result of one does not depend on the others, to the last bit.
 
-Unit quaternions (eta, eps) of b relative to n, as far as the thesis's filters need them.
+Unit quaternions (eta, eps) give the attitude of b relative to n:
 
     R_nb = I + 2 eta S(eps) + 2 S(eps)^2
     q'   = 1/2 T(q) w = 1/2 Omega(w) q                                            (2.6)
@@ -13,8 +13,6 @@ both frames half a turn about their x axes changes the sign of eps_2 and eps_3 a
 the equations as they are.
 
 R_nb is quadratic in q, T is linear: their derivatives are constant tensors, made once.
-
-Rows that belong to the epochs of a log, or of the logs of a batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -228,7 +226,7 @@ Index = int | NDArray[np.int64]  # of an epoch, or of one for each member of a b
 
 
 class Epochs:
-    """What is given at each epoch; those of several logs lie one after the other.
+    """Given values at each epoch; those of several logs lie one after the other.
 
     Parameters
     ----------

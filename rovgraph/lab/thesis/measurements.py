@@ -1,16 +1,16 @@
-"""The MTi at one epoch: specific force, angular rate and magnetic field (3.14).
+"""Measurements of the thesis's filters: the MTi (3.14) and the DVL's pings (3.17).
+
+The MTi measures specific force, angular rate and magnetic field at one epoch:
 
     y = [R_sb (a_b + w x (w x l) - R_bn g) ; R_sb w ; R_sb R_bn H] + b
 
 with the sign of gravity corrected, the field as a fraction of its length, and the nine
-biases in the MTi's axes. ``rovgraph.sensors.MagneticField`` says the same of many epochs at
-once; at 100 Hz that costs more than the filter itself. A test holds the two together.
+biases in the MTi's axes. ``rovgraph.sensors.MagneticField`` has the same equation for many epochs at
+once; at 100 Hz that costs more than the filter itself. A test compares the two.
 
-The DVL's pings: velocity and compass heading at once (3.17).
-
-The models are `rovgraph.sensors.DvlVelocity` and `rovgraph.sensors.CompassHeading`, whose
-derivatives by a rotation in b are chained to the quaternion: a change dq of a unit
-quaternion is a rotation of ``2 T(q)' dq``.
+A ping of the DVL has velocity and compass heading at once. Its models are `rovgraph.sensors.DvlVelocity` and
+`rovgraph.sensors.CompassHeading`, whose derivatives by a rotation in b are chained to the quaternion: a change dq of a
+unit quaternion is a rotation of ``2 T(q)' dq``.
 """
 
 import copy
@@ -53,7 +53,7 @@ def reference_field(instrument: Instrument, beliefs: dict[str, Belief]) -> Array
 
 
 class ImuModel(Protocol):
-    """What the inertial unit measures.
+    """Measurement model of the inertial unit.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ HEADING = 3  # its place among x, y, z, heading
 
 @dataclass(frozen=True)
 class Ping:
-    """What came from the DVL at one time.
+    """The DVL's measurements at one time.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How the vehicle moves between two epochs, for each filter of the thesis.
+"""Process models of the thesis's filters, and the attitude that some of them take as given.
 
 Constant acceleration and rate in b (2.9) and in n (2.8):
 
@@ -15,12 +15,10 @@ All are discretised by forward Euler (2.26), ``x <- x + dt x'``, ``F = I + dt A`
 A process of several filters side by side is made from theirs by ``together``; states,
 intervals and epochs then have a leading axis for the filters.
 
-Attitude and rate as the inertial unit gives them, for 4.1 and 4.2.
-
-The thesis takes the MTi's own fused attitude and rate. A log that has it (``ahrs_*``) is
-taken at its word, calibration of its heading at the means. Without it the accelerometer
-levels each sample, as if the vehicle did not accelerate, and the magnetometer gives the
-heading; such an attitude is far noisier than a fused one.
+For 4.1 and 4.2 the inertial unit gives attitude and rate. The thesis uses the MTi's own fused attitude, which a log may
+have (``ahrs_*``), with the calibration of its heading at the means. Without it the accelerometer levels each sample, as
+if the vehicle did not accelerate, and the magnetometer gives the heading; such an attitude is far noisier than a fused
+one.
 """
 
 import copy
@@ -169,7 +167,7 @@ class Process(Protocol):
         ...
 
     def noise(self, x: Array) -> Array:
-        """Q of one second, shape (..., n, n), or the diagonal alone, ``diagonal`` says so."""
+        """Q of one second, shape (..., n, n), or the diagonal alone, by ``diagonal``."""
         ...
 
     @classmethod

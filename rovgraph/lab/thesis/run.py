@@ -1,25 +1,18 @@
-"""The thesis's filters over whole logs.
+"""The thesis's filters over whole logs: predict to each epoch, update with what was measured there.
 
-From the states that a recursion kept to an `Estimate`.
+Inertial samples come at their own epochs, pings at theirs: a ping between two samples is reached by a shorter step.
+Filters of one kind go in lock step (`timetable`), as one recursion over arrays with a leading axis for the filters: at
+25 states a filter by itself spends most of its time on calling NumPy. A filter that is idle at a step moves by zero
+time and skips the measurement, which changes neither state nor covariance. So each filter gives the result that it
+gives alone, and the others continue where one diverges.
 
-The recursion: predict to each epoch, update with what was measured there.
+At each step of the timetable all take an inertial sample, or all take a ping. The times of different logs are
+unrelated; so the first pings of all are one step, the second ones are one step, and between them each takes the samples
+of its own log that lie there. A filter with fewer of them is idle until the others have taken theirs. Pings come at
+about the same rate in all logs, so idle steps are few. A ping between two samples comes between them; at equal times
+the sample comes first.
 
-Inertial samples come at their own epochs, pings at theirs: a ping between two samples is
-reached by a shorter step. Filters of one kind go in lock step (`timetable`), as one
-recursion over arrays with a leading axis for the filters: at 25 states a filter by itself
-spends most of its time on calling NumPy. Who is idle at a step moves by no time and
-measures nothing, which changes neither state nor covariance. So each filter does what it would do
-alone, and the others go on where one diverges.
-
-When the filters of a batch do what, so that they go in lock step.
-
-At each step all take an inertial sample, or all take a ping. Their logs have different
-epochs, and nothing ties one filter's time to another's; so the first pings of all are one
-step, the second ones are one step, and between them each takes the samples of its own log
-that lie there. Who has fewer of them is idle until the others are through. Pings come at
-about the same rate in all logs, so that this is little.
-
-A ping between two samples comes between them; at equal times the sample comes first.
+The states that are kept become an `Estimate` of the body's origin.
 """
 
 import difflib
@@ -523,7 +516,7 @@ class FilterJob:
 def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory | None = None) -> Estimate:
     """Run one of the thesis's filters.
 
-    Heading sources are the filter's own, whatever ``heading.sources`` says; calibration
+    Heading sources are the filter's own, whatever ``heading.sources`` is; calibration
     stands at its means but for what the filter has as states; nothing is gated.
 
     Parameters
@@ -536,7 +529,7 @@ def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory 
     -------
     Estimate : ``kind`` is the filter's name; trajectory of the body's origin at the first
         epoch, the pings and the last epoch; innovations of every ping and every tenth IMU
-        sample, whitened, see `rovgraph.lab.thesis.run`
+        sample, whitened
 
     Raises
     ------

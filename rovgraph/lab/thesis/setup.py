@@ -1,6 +1,6 @@
-"""From a filter, a log and a configuration to what the recursion needs.
+"""Prepares the recursion from a filter, a log and a configuration.
 
-The true motion as a place to linearise at, for studies of what linearisation costs.
+`TrueMotion` is the true motion as the point of linearisation, for studies of the cost of linearisation.
 """
 
 from dataclasses import dataclass
@@ -146,7 +146,7 @@ def _demand(variant: Filter, log: Log, config: Config) -> None:
 
 
 def _with_sources(variant: Filter, log: Log, config: Config) -> Config:
-    """The configuration with the heading sources of the filter, whatever it says itself."""
+    """The configuration with the heading sources of the filter in place of its own."""
     if variant.attitude_given:
         sources = ["ahrs" if "ahrs" in log else "mag"]
     else:

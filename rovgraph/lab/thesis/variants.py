@@ -1,4 +1,4 @@
-"""The filters of the thesis by name, and what a study may change in them."""
+"""The filters of the thesis by name, and the numbers in them that a study may change."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -61,7 +61,7 @@ class Filter:
     noise_frame : axes that `Numbers.acceleration` belongs to, None = the process's own;
         it matters only where the three differ
     iterations : of a measurement update; 1 = EKF
-    linearized_at : "estimate", or "truth": Jacobians at the true motion, which a study knows
+    linearized_at : "estimate", or "truth": Jacobians at the true motion, available in a study
     compass_mount : the DVL's angles in its compass heading, where they are states:
         "estimated", or "held" at their means, as psi_DVL of (3.17) may be read
     """
@@ -94,7 +94,7 @@ class Filter:
 
     @property
     def kind(self) -> "Filter":
-        """What it has in common with those that it can go in lock step with: all but name, headings and numbers."""
+        """Key shared by filters that can run in lock step: all but name, headings and numbers."""
         return replace(self, name="", section="", about="", magnetometer=False, compass=False, numbers=_ANY)
 
     def with_numbers(self, **numbers: Any) -> "Filter":

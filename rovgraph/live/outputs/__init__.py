@@ -1,7 +1,8 @@
-"""Where solutions go: a name or URL to an `Output`. docs/online-output.md says what each sends.
+"""Outputs of navigation solutions: a name or URL becomes an `Output`. docs/online-output.md describes each.
 
-An output never blocks and never raises for what the far side does: what cannot be sent is
-dropped, counted, and complained of once per kind and minute.
+An output never blocks, and a fault of the receiver never raises an error: solutions that cannot be sent are dropped,
+counted, and reported once per kind and minute. May import what `rovgraph.live` may. Begin with `output` (what all
+share), then `json_lines`.
 """
 
 from rovgraph.errors import InputError
@@ -34,7 +35,7 @@ def open_output(url: str, warnings: Warnings | None = None, patient: bool = Fals
     Parameters
     ----------
     url : one of `FORMS`, with options as in ``udp://host:port?rate=5``
-    warnings : told, from other threads too, of what goes wrong later
+    warnings : receives later errors, from other threads too
     patient : standard output waits for its reader instead of dropping lines, as a replay may
 
     Raises

@@ -1,10 +1,6 @@
-"""A solution as a line of JSON; docs/online-output.md is the contract.
+"""A solution as a line of JSON, to standard output, to TCP readers, or as UDP datagrams.
 
-JSON lines on standard output.
-
-JSON lines to any number of readers that connect.
-
-JSON lines as datagrams.
+docs/online-output.md is the contract.
 """
 
 import contextlib
@@ -119,7 +115,7 @@ class StandardOutput(Output):
 
 
 def _written(descriptor: int, data: bytes) -> int:
-    """Bytes taken; waits also where somebody else made the file non-blocking."""
+    """Bytes taken; waits also where another process made the file non-blocking."""
     while True:
         try:
             return os.write(descriptor, data)
@@ -136,8 +132,8 @@ LOOPBACK = "127.0.0.1"
 class TcpOutput(Output):
     """Listens, on the loopback unless a host is written, and sends every line to every reader.
 
-    A reader that is too slow loses lines, the oldest first, and holds up nobody. Nothing
-    waits: readers are let in, and queues emptied as far as they go, when a solution is sent.
+    A reader that is too slow loses lines, the oldest first, and does not delay others. Sending never
+    waits: readers are accepted, and queues emptied as far as they go, when a solution is sent.
 
     Raises
     ------
@@ -231,7 +227,7 @@ class _Reader:
                 self._begun = self._begun[self.socket.send(self._begun) :]
 
     def close(self) -> None:
-        """End the connection; what the reader said is taken first, or the system would cut it off."""
+        """End the connection; the reader's bytes are taken first, or the system would cut it off."""
         with contextlib.suppress(OSError):
             self.socket.recv(1 << 16)
             self.socket.shutdown(socket.SHUT_WR)
@@ -239,7 +235,7 @@ class _Reader:
 
 
 class UdpOutput(Output):
-    """One JSON line per datagram; whether anybody listens is not known.
+    """One JSON line per datagram; without knowing whether a reader listens.
 
     Raises
     ------

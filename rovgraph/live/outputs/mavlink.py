@@ -1,6 +1,4 @@
-"""Solutions to an autopilot over any connection of pymavlink.
-
-Solutions as MAVLink 2 messages.
+"""Solutions as MAVLink 2 messages, to an autopilot over any connection of pymavlink.
 
 Fields: https://mavlink.io/en/messages/common.html, GPS_INPUT (232) and VISION_POSITION_ESTIMATE
 (102). Both take north, east, down and forward, starboard, down, as a solution does.
@@ -194,7 +192,7 @@ class MavlinkOutput(Output):
         return True
 
     def _beat(self) -> None:
-        """Say who is there, so that routers and autopilots know."""
+        """Announce this component to routers and autopilots."""
         if time.monotonic() - self._beaten < HEARTBEAT_S:
             return
         self._beaten = time.monotonic()
@@ -214,7 +212,7 @@ class MavlinkOutput(Output):
 
 
 class _Whole:
-    """What pymavlink's messages are written to; it raises where a link only tells that it failed."""
+    """What pymavlink's messages are written to; it raises where a link only reports that it failed."""
 
     def __init__(self, link: Any) -> None:
         self._link = link
@@ -229,7 +227,7 @@ def _gone() -> None:
 
 
 def _drain(link: Any) -> None:
-    """Take what comes in: it fills the system's buffers, and it is how ``udpin`` learns whom to send to."""
+    """Take what comes in: it fills the system's buffers, and from it ``udpin`` learns the address to send to."""
     for _ in range(100):
         if not link.recv(4096):
             return

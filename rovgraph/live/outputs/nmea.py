@@ -1,6 +1,6 @@
 """NMEA 0183 sentences for chart plotters: GGA (position), HDT (true heading) and VTG (course and speed).
 
-What a GPS receiver would say, for those who only listen to one.
+The output imitates a GPS receiver, for programs that read only one.
 """
 
 import math

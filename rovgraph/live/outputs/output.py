@@ -1,8 +1,6 @@
-"""What all outputs have in common.
+"""The base of all outputs: their URLs, their protocol, and a thread for blocking calls.
 
-URLs of outputs: ``scheme:place?option=value``.
-
-A thread that does what may block, and a short queue in front of it.
+A URL is ``scheme:place?option=value``. `Background` is the thread, with a short queue in front of it.
 """
 
 import math
@@ -56,7 +54,7 @@ class Url(NamedTuple):
 
         Raises
         ------
-        InputError : it is none, or not from ``low`` to ``high``
+        InputError : not a number, or not from ``low`` to ``high``
         """
         if option not in self.options:
             return default
@@ -131,7 +129,7 @@ class Output(ABC):
         self._complaints.complain(self.url.text, kind, text)
 
     def _drop(self, count: int, kind: str, text: str) -> None:
-        """Count what is given up, and say it; from any thread."""
+        """Count what is given up, and report it; from any thread."""
         with self._counting:
             self.dropped += count
         self._complain(kind, f"{text}; {self.dropped} dropped so far")

@@ -1,12 +1,8 @@
-"""Where messages come from.
+"""Sources of messages: from a URL to a link and a decoder.
 
-A source is a link, which yields bytes as they come, and a decoder, which makes messages of
-them and knows nothing of where they came from. `opening` makes sources of URLs;
-docs/online-sources.md is the contract.
-
-The URL of a source, taken apart, and what is wrong with one.
-
-From a URL to a source.
+A link yields bytes as they come; a decoder makes messages of them, whatever the link. May import what `rovgraph.live`
+may. Begin with `source` (`Source`, `Link`, `Decoder`), then `links` and `json_lines`; `open_sources` takes URLs apart
+and reports errors in them. docs/online-sources.md is the contract.
 """
 
 import math
@@ -33,7 +29,7 @@ from rovgraph.model.config import Config
 from rovgraph.readers.mavlink import IMUS
 
 LOOPBACK = "127.0.0.1"
-_OPTIONS = re.compile(r"\?(?=\w+=)")  # a question mark in a file's name is none
+_OPTIONS = re.compile(r"\?(?=\w+=)")  # a question mark in a file's name is not an option
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ class SourceUrl:
 
         Parameters
         ----------
-        readers : name -> from text to value; raises ValueError, whose message says what was expected
+        readers : name -> from text to value; raises ValueError, whose message states what was expected
 
         Raises
         ------
@@ -150,7 +146,7 @@ def one_of(*known: str) -> Callable[[str], str]:
 
 MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
-Known = MutableMapping[str, float]  # what a source has found out and a run that is resumed goes on with
+Known = MutableMapping[str, float]  # values that a source has found and a resumed run needs
 Opener = Callable[[SourceUrl, Notify, Config, float, Known], Source]
 FORMS = {
     "-": "-",
@@ -204,7 +200,7 @@ def open_source(
     speed: str = "1",
     known: Known | None = None,
 ) -> Source:
-    """The source of a URL; docs/online-sources.md says which there are.
+    """The source of a URL; docs/online-sources.md lists them.
 
     Parameters
     ----------
@@ -251,7 +247,7 @@ def _pace(text: str) -> float:
 
 
 def _unknown(address: SourceUrl) -> InputError:
-    """What to say of a URL of no known form, with the form that was probably meant."""
+    """Message on a URL of unknown form, with the form that was probably meant."""
     known = f"known are {', '.join(FORMS.values())}"
     if Path(address.url).suffix.lower() == ".tlog":
         meant = f"mavlink:{address.url}"

@@ -1,8 +1,7 @@
-"""Doppler instruments, live: PD4, PD5 and PD6 of Teledyne and others, Cerulean's Tracker 650, and Nortek's Nucleus.
+"""Doppler instruments, live: PD4, PD5 and PD6, Cerulean's Tracker 650, Nortek's Nucleus, Water Linked's A50 and A125.
 
-Their bytes are read as those of their files are (`rovgraph.readers.pd4`, `pd6`, `cerulean` and `nucleus`).
-
-Water Linked A50 and A125, live: reports over TCP, which `rovgraph.readers.waterlinked` reads.
+Their bytes are read as those of their files are (`rovgraph.readers.pd4`, `pd6`, `cerulean`, `nucleus` and
+`waterlinked`).
 """
 
 from collections.abc import Iterable, Iterator
@@ -120,7 +119,7 @@ def waterlinked(url: str, notify: Notify) -> LineDecoder:
 
 
 def report_message(row: dict[str, Any], url: str, arrival: float, notify: Notify) -> Message | None:
-    """What a report says; None where it is about no measurement.
+    """The readings of a report; None without a measurement.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """JSON lines with a log's columns as keys: one object per row.
 
-What a configuration says of a log's names and units holds for them too, so that the rows of a
-log, written as JSON lines, say what the log says.
+The configuration's names and units for a log hold for them too, so that the rows of a log, written as JSON lines, give
+the same measurements.
 """
 
 import math
@@ -25,7 +25,7 @@ from rovgraph.readers.waterlinked import is_report
 from rovgraph.sensors import SENSORS
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
-UNKNOWN = 20  # unknown keys that are told apart
+UNKNOWN = 20  # unknown keys that are counted separately
 
 _AS_IT_IS = Scale()
 _OTHERS = dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
@@ -61,13 +61,13 @@ class JsonRow:
         self._names = {theirs: ours for ours, theirs in config.columns.items()}
         self._scale = scales(config.units, url)
         self._angles, self._rules = config.angles, config.times.rules
-        turn_angles({}, config.angles, url)  # an unknown one is told before the first line
+        turn_angles({}, config.angles, url)  # an unknown one is reported before the first line
         self._unknown: set[str] = set()
         self._sensors = {c: sensor.name for sensor in SENSORS.values() for c in sensor.required} | _OTHERS
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
 
     def message(self, line: bytes, arrival: float) -> Message | None:
-        """What a line says; None where that is no measurement.
+        """The readings of a line; None without a measurement.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class JsonRow:
 
         Raises
         ------
-        Refused : it is none, or may be of two days
+        Refused : not a time, or it may be of two days
         """
         try:
             time, how = seconds_of_texts(pd.Series([text]), self._rules, lambda _: "time")
@@ -131,7 +131,7 @@ class JsonRow:
             self._notify("unknown key", "more keys are ignored", once=True)
 
     def _sensor(self, column: str) -> str | None:
-        """Whose column it is, where it says nothing without others."""
+        """The sensor of a column that means nothing without others."""
         return "thruster" if THRUSTER.fullmatch(column) else self._sensors.get(column)
 
     def _join(self, cells: dict[str, float], stamp: float | None, arrival: float) -> set[str]:
@@ -164,7 +164,7 @@ def _check(cells: dict[str, float]) -> None:
     if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
         raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
     for name in ("dvl_sd", "fix_sd", "place_sd"):
-        if cells.get(name, 1.0) <= 0.0:  # as many instruments say that they do not know
+        if cells.get(name, 1.0) <= 0.0:  # as many instruments mark a missing estimate
             del cells[name]
     lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
     beyond = abs(lat) > 90.0 or abs(lon) > 360.0
@@ -173,6 +173,6 @@ def _check(cells: dict[str, float]) -> None:
         lat = lon = 0.0
     if abs(lat) > 90.0 or abs(lon) > 360.0:
         raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
-    if all(cells.get(name) == 0.0 for name in LAT_LON):  # how a receiver without a fix says so
+    if all(cells.get(name) == 0.0 for name in LAT_LON):  # a receiver without a fix
         for name in LAT_LON:
             del cells[name]

@@ -1,6 +1,6 @@
-"""Links to the outside: TCP, UDP, standard input, serial ports. All end within `STOP_S` or so.
+"""Links: TCP, UDP, standard input, serial ports and files. All end within `STOP_S` or so.
 
-Links to files: as they are, and telemetry logs (.tlog), where a time stands before each message.
+Files are read as they are; in telemetry logs (.tlog) a time precedes each frame.
 """
 
 import contextlib
@@ -132,7 +132,7 @@ def _received(connection: socket.socket, stop: threading.Event) -> Iterator[Chun
 
 
 class UdpLink:
-    """Listens for datagrams, from whoever sends them.
+    """Listens for datagrams, from any sender.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class UdpLink:
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
         with self._socket:
             while not stop.is_set():
-                # Windows reports a datagram of ours that nobody took as an error of the next read
+                # Windows reports an undelivered datagram as an error of the next read
                 with contextlib.suppress(TimeoutError, ConnectionError):
                     data = self._socket.recv(BLOCK)
                     yield Chunk(data + self._end, time.time(), fresh=True)
@@ -291,5 +291,5 @@ class TelemetryReplay:
 
 
 def timed_frames(content: bytes) -> Iterator[Chunk]:
-    """Frames of a telemetry log; what stands between them and is none comes as a chunk too."""
+    """Frames of a telemetry log; bytes between them come as chunks too."""
     return (Chunk(data, time, fresh=True) for data, time in frames_with_times(content))

@@ -1,4 +1,4 @@
-"""MAVLink, live: what an autopilot tells of its sensors; `rovgraph.readers.mavlink` reads the messages."""
+"""MAVLink, live: an autopilot's sensors; `rovgraph.readers.mavlink` reads the messages."""
 
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from rovgraph.readers.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, 
 from rovgraph.readers.recording import too_slow
 
 VEHICLE_COMPONENT = 1
-ENOUGH = 20  # samples of an IMU that tell its rate
+ENOUGH = 20  # samples of an IMU that give its rate
 
 
 @dataclass(frozen=True)
 class MavlinkOptions:
-    """What a URL may say.
+    """Options of a URL.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class MavlinkDecoder:
                     yield said
 
     def _of_vehicle(self, message: Any) -> bool:
-        """Whether the vehicle's autopilot says this. A DVL's velocity is said to it, by anyone."""
+        """Whether the vehicle's autopilot sent this. A DVL's velocity may come from any sender."""
         if message.get_type() == "VISION_POSITION_DELTA":
             return True
         if self._system is None and message.get_srcComponent() == self._options.component:
@@ -116,7 +116,7 @@ class MavlinkDecoder:
         return Message(self._url, arrival, seconds or None, good, clock if seconds else "") if good else None
 
     def _said_usec(self, arrival: float, usec: float, *found: Reading, sender: str = "") -> Message | None:
-        """As `_said`, of a time that is since 1970 or since the start, by the clock of whoever sends it."""
+        """As `_said`, of a time that is since 1970 or since the start, by the sender's clock."""
         return self._said(arrival, 1e-6 * usec, *found, clock=("unix" if usec > UNIX_USEC else "boot") + sender)
 
     def _imu(self, message: Any, arrival: float) -> Message | None:
@@ -137,7 +137,7 @@ class MavlinkDecoder:
         return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([magnetic, roll, pitch])))
 
     def _parameter(self, message: Any, arrival: float) -> None:
-        """Of the autopilot, which tells them to whoever asks for them."""
+        """Of the autopilot, which sends them on request."""
         name = message.param_id
         self._parameters[name.rstrip("\0") if isinstance(name, str) else name.decode("ascii", "replace")] = float(
             message.param_value

@@ -1,7 +1,7 @@
 """NMEA 0183, live: headings, attitudes and fixes; `rovgraph.readers.nmea_sentences` reads the sentences.
 
-Headings become the log's `ahrs_yaw`, which is of a compass: one that is relative to true north is
-turned by the configuration's declination.
+Headings become the log's `ahrs_yaw`, which is a compass's: a heading from true north is turned by the configuration's
+declination.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ def nmea(url: str, notify: Notify, config: Config, recorded: bool = False) -> Li
 
     Parameters
     ----------
-    recorded : a file, in which sentences arrive at the time that those before them tell
+    recorded : a file, in which sentences arrive at the time of those before them
 
     Raises
     ------
@@ -67,11 +67,11 @@ class NmeaDecoder:
         }
 
     def message(self, line: bytes, arrival: float) -> Message | None:
-        """What a sentence says.
+        """The readings of a sentence.
 
         Raises
         ------
-        Refused : it is none, or not whole
+        Refused : not a sentence, or not whole
         """
         kind, text = sentence_of(line)
         if kind not in self._read and kind not in ATTITUDES:

@@ -1,4 +1,4 @@
-"""A log of ours, as if it came in now."""
+"""Replay of a log as if it came in now."""
 
 import threading
 from collections.abc import Iterator, Sequence

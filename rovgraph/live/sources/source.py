@@ -1,8 +1,6 @@
 """A source of messages: a link that yields bytes, and a decoder that makes messages of them.
 
-Decoders of bytes that work line by line.
-
-One of several kinds of message that say the same.
+`LineDecoder` decodes line by line. `Preferred` chooses one of several kinds of message with the same content.
 """
 
 import math
@@ -19,7 +17,7 @@ STOP_S = 0.2  # longest wait of a link before it looks whether it shall stop
 
 
 class Source(Protocol):
-    """Something that says what sensors measured.
+    """A source of sensors' measurements.
 
     Attributes
     ----------
@@ -36,7 +34,7 @@ class Source(Protocol):
     def lossy(self) -> bool: ...
 
     def messages(self, stop: threading.Event) -> Iterator[Message]:
-        """What the source says, as it comes, until it ends or ``stop`` is set, which it obeys within 0.5 s.
+        """The source's messages, as they come, until it ends or ``stop`` is set, which it obeys within 0.5 s.
 
         Never raises for what the far side does. Once only.
         """
@@ -130,7 +128,7 @@ class LineDecoder:
     Parameters
     ----------
     parse : from a line without its end, not empty, and its arrival to a message, or None where it
-        says nothing of a sensor; raises `Refused`
+        has no sensor data; raises `Refused`
     notify : takes warnings
     """
 

@@ -1,7 +1,8 @@
-"""Presets: what data sheets state of an instrument, as keys and values of the configuration.
+"""Presets: instruments' data sheets as keys and values of the configuration.
 
-The YAML files beside this module hold them, a file per maker. A number stands as its data sheet states it, with its
-unit and its source; it is converted here. What no source states is not filled in.
+The YAML files beside this module hold them, a file per maker. A number is written as its data sheet states it, with
+its unit and its source; it is converted here. A value that no source states stays empty. May import what
+`rovgraph.model` may. Begin with `Preset`.
 """
 
 import difflib
@@ -53,7 +54,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Preset:
-    """What is known of an instrument.
+    """Data sheet of an instrument.
 
     Attributes
     ----------
@@ -104,7 +105,7 @@ def known_preset(kind: str, name: str) -> str:
 
     Raises
     ------
-    PydanticCustomError : there is none; the nearest one is named
+    PydanticCustomError : no such preset; the nearest one is named
     """
     known = [p.name for p in presets().values() if p.kind == kind]
     if name not in known:

@@ -1,8 +1,8 @@
-"""A mapping of the columns of anyone's table, proposed by names, ranges and physics (docs/formats.md).
+"""Proposes a mapping of the columns of any table, by names, ranges and physics (docs/formats.md).
 
-What the columns of anyone's table may be: names propose, ranges and physics decide units and raise doubt.
-
-A column whose name says nothing is at most unsure, whatever its numbers look like.
+Names propose; ranges and physics decide units and raise doubt. A column whose name is not recognised is marked unsure
+at best, whatever its numbers. May import what `rovgraph.readers` may. Begin with `names` (the words of a column's
+name), then `groups` (columns by sensor and source) and `quantities`.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ NAMELESS = "its numbers go on; its name does not say so"
 
 
 def guess_table(table: Table) -> Guesses:
-    """What the columns of a table may be.
+    """Guess the columns of a table.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _is_number(text: str) -> bool:
 
 
 def _time(table: Table, candidates: Mapping[str, Candidate], unnamed: Mapping[str, Array], out: Guesses) -> Candidate:
-    """The column of stamps, by its name, else one whose numbers go on.
+    """The column of stamps, by its name, else one whose numbers increase.
 
     Raises
     ------

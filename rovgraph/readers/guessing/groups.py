@@ -1,13 +1,11 @@
-"""The columns of a table by sensor and source, and what is proposed for each.
+"""The columns of a table by sensor and source, the proposal for each, and their units by ranges and physics.
 
-Units of foreign columns by ranges and physics.
-
-Gravity gives the unit of a specific force; what turns by one sensor turns by another, which gives the unit of a gyro,
+Gravity gives the unit of a specific force. A gyro's unit follows from the turns of another sensor,
 
     d(heading)/dt = b w . down,    d(f)/dt = -b w x f,
 
-and what sinks by the DVL sinks by the pressure sensor. Changes of means over a second are compared, so that offsets
-and biases drop out.
+and a DVL's from the sinking by the pressure sensor. Changes of means over a second are compared, so that offsets and
+biases drop out.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +30,7 @@ STEP_S = 0.0005, 0.5  # of an IMU's samples [s]: each lasts less than the factor
 SLOW_STEP_S = 0.02, 20.0  # of other rows
 SPEED = 0.05, 5.0  # of a vehicle, most of the time [m/s]
 DEEPEST = 12e3  # [m]
-SHALLOW = 100.0  # numbers of a depth up to this are taken for metres where nothing else tells
+SHALLOW = 100.0  # numbers of a depth up to this are taken for metres without other evidence
 WINDOW = 1.0  # [s]
 PERIODS = 3.0
 ENOUGH = 20  # changes that are compared
@@ -79,7 +77,7 @@ def ratio(a: ForeignSignal, b: ForeignSignal, regressed: bool = False) -> tuple[
 
     Parameters
     ----------
-    regressed : a alone is disturbed, by something else that b does not know
+    regressed : a alone is disturbed, by a motion that is not in b
     """
     window = max(WINDOW, PERIODS * a.period, PERIODS * b.period)
     if len(a.time) < 2 or len(b.time) < 2 or not np.isfinite(window):
@@ -252,7 +250,7 @@ ORDER: tuple[Sureness, ...] = ("sure", "likely", "unsure")
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """What a column may be.
+    """Guess of a column.
 
     Attributes
     ----------
@@ -260,7 +258,7 @@ class ColumnGuess:
     field : column of a log that it may feed
     unit : that it is in, as a configuration names it; "" = none to state
     why : a phrase
-    sureness : "sure" = name and numbers agree, "likely" = one of them says so, "unsure" = not proposed
+    sureness : "sure" = name and numbers agree, "likely" = one of them does, "unsure" = not proposed
     """
 
     column: str
@@ -272,7 +270,7 @@ class ColumnGuess:
 
 @dataclass
 class Guesses:
-    """What the columns of a table may be.
+    """Guesses of the columns of a table.
 
     Attributes
     ----------
@@ -321,7 +319,7 @@ class Candidate:
 class Group:
     """Columns of one sensor, of one source.
 
-    ``likely`` tells why the choice may be wrong, "" = nothing does.
+    ``likely`` is why the choice may be wrong, "" = it is clear.
     """
 
     columns: Mapping[str, Candidate]

@@ -1,7 +1,7 @@
-"""What the name of a column in anyone's table says: the column of a log that it may be, its source and its unit.
+"""Names of columns in any table: the column of a log that each may be, its source and its unit.
 
 A name is read as words: split at signs, blanks and capitals, and where an axis is glued to a known word (``xacc``,
-``wx``). Words decide; numbers are not looked at here.
+``wx``). Only words are used here, not the numbers.
 """
 
 import re
@@ -61,17 +61,17 @@ _DERIVED = {
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a name says.
+    """The meaning of a name.
 
     Attributes
     ----------
     field : column of a log, "" = none
-    source : the other words, which tell instruments apart
+    source : the other words, which distinguish instruments
     unit : that the name states, a key of `UNITS`; "" = none
-    why : what the field follows from, or why there is none
+    why : what the field follows from, or why there is no field
     assumed : what the name leaves open, "" = nothing
     backwards : it is of an axis to port or upwards
-    enu : it says that its axes are east, north, up
+    enu : its axes are east, north, up
     """
 
     field: str
@@ -84,7 +84,7 @@ class Meaning:
 
 
 def meaning(written: str) -> Meaning:
-    """What the name of a column says.
+    """The meaning of a column's name.
 
     >>> meaning("RAW_IMU.xacc").field, meaning("Gyro X [deg/s]").unit, meaning("depth_mm").unit
     ('acc_x', 'deg/s', 'mm')
@@ -206,7 +206,7 @@ def _scalar(words: set[str]) -> str:
 
 
 def _source(words: Collection[str]) -> str:
-    """What a name says beside quantity and axis."""
+    """The words of a name beside quantity and axis."""
     spoken = {
         "enu",
         *_AXES,

@@ -1,6 +1,6 @@
-"""Inertial columns and angles: gravity gives the unit of a force, and gyro and heading give each other's.
+"""Quantities of foreign columns: inertial columns and angles, velocity and depth, altitude and fixes.
 
-Velocity and depth, which give each other's unit; altitude and fixes.
+Gravity gives the unit of a specific force; gyro and heading, and velocity and depth, give each other's.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,7 +53,7 @@ def guess_imu(groups: Mapping[str, Group], time: Array, out: Guesses) -> None:
 
 
 def _mounting(force: ForeignSignal, out: Guesses) -> None:
-    """Say where gravity lies."""
+    """Note the axis of gravity."""
     f = np.median(force.values, axis=0)
     if abs(f[2]) < LEVEL * np.linalg.norm(f):
         axis = "xyz"[int(np.abs(f).argmax())]
@@ -79,7 +79,7 @@ class _Gyro:
 
     Attributes
     ----------
-    rate : its numbers; None = there are none
+    rate : its numbers; None = no rate
     turned : about the vertical, in its numbers; None = the vertical is not known
     stated : unit by its name, "" = none
     units : that are left
@@ -185,7 +185,7 @@ NOTHING = ForeignSignal(np.empty(0), np.empty((0, 3)))
 
 
 def guess_doppler(groups: Mapping[str, Group], time: Array, out: Guesses) -> None:
-    """Velocity and depth, by what both say of the descent."""
+    """Velocity and depth, by the descent in both."""
     depth, moving = groups.get("depth"), groups.get("dvl")
     sunk = NOTHING if depth is None else depth.signal(time, ("depth",))
     way = NOTHING if moving is None else moving.signal(time, VECTORS["dvl"][:3])
@@ -220,7 +220,7 @@ def _axes(moving: Group, out: Guesses) -> None:
 def _descending(
     sunk: ForeignSignal, way: ForeignSignal, lengths: Sequence[str], speeds: Sequence[str]
 ) -> list[tuple[str, str]] | None:
-    """Units in which depth and DVL descend alike; None where nothing tells."""
+    """Units in which depth and DVL descend alike; None without evidence."""
     down = ForeignSignal(way.time, way.values[:, -1:])
     slope, correlation = physics.ratio(sunk, down.integrated())
     if abs(correlation) < physics.CORRELATION:

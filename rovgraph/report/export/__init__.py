@@ -1,6 +1,7 @@
-"""A track as files that others open: maps, bags, tables and subtitles; and the track at other tables' times.
+"""Exports of a track: maps, bags, tables and subtitles; and the track at the times of another table.
 
-`track` is what is written, `formats` finds the writers, each in a module of its own; `tagging` places photos.
+May import what `rovgraph.report` may. Begin with `track` (the data to export) and `formats` (finds the writers, a
+module for each kind); `tagging` places photos. docs/export.md describes the use.
 """
 
 from rovgraph.report.export.formats import (

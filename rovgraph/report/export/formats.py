@@ -23,7 +23,7 @@ GROUP = "rovgraph.exports"
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What a user may say of how a track is written.
+    """A user's options for writing a track.
 
     Attributes
     ----------

@@ -1,10 +1,12 @@
-"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; heights above sea level.
+"""Maps: GeoJSON, KML and KMZ, GPX, GeoPackage and shapefile.
+
+GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; heights above sea level.
 
 KML and KMZ for Google Earth and chart plotters: a track that moves with time, 95 % ellipses and fixes.
 
 GPX 1.1 for chart plotters and phones: a track; elevation is above sea level.
 
-GeoPackage and shapefile for a GIS: points with everything that is known of them, in any coordinates.
+GeoPackage and shapefile for a GIS: points with all their values, in any coordinates.
 """
 
 import json

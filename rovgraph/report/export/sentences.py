@@ -1,4 +1,6 @@
-"""NMEA 0183 for whatever replays a ship's log: GGA, HDT and VTG at a rate.
+"""Text in time: NMEA 0183 and subtitles.
+
+NMEA 0183 for programs that replay a ship's log: GGA, HDT and VTG at a rate.
 
 SRT subtitles of position and heading for the dive's video, which begins with the track.
 """

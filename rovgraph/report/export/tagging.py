@@ -1,7 +1,7 @@
 """Where the vehicle was at the times of another table: photos, sonar pings, samples.
 
 Between keyframes position is interpolated along a line and attitude along the shortest arc (slerp). Keyframes are a
-fraction of a second apart, so what an acceleration of 0.1 m/s2 bends within 0.2 s is half a millimetre.
+fraction of a second apart; an acceleration of 0.1 m/s2 bends the track by half a millimetre within 0.2 s.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
     Parameters
     ----------
     table : any columns
-    column : of times, in seconds of the track's clock, or dates (UTC where they do not say) if that is Unix time
+    column : of times, in seconds of the track's clock, or dates (UTC without a stated zone) if that is Unix time
     offset : what is added to the table's times, to come to the track's [s]
 
     Raises

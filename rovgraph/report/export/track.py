@@ -1,7 +1,4 @@
-"""What an export is made from: a trajectory with its place on Earth, its time and its fixes.
-
-A track as a table of points with everything that a map can show of them.
-"""
+"""The data of an export: a trajectory with its place on Earth, its time and its fixes, as a table of points."""
 
 import json
 from dataclasses import dataclass, replace
@@ -245,7 +242,7 @@ def _read_fixes(folder: Path) -> Fixes | None:
 
 
 def fixes_of(residuals: pd.DataFrame) -> Fixes | None:
-    """The fixes among residuals (docs/results.md), None where there are none."""
+    """The fixes among residuals (docs/results.md), None without any."""
     own = residuals[residuals["sensor"] == "fix"]
     north, east = (own[own["component"] == name] for name in ("north", "east"))
     if not len(north) or len(north) != len(east):
@@ -254,7 +251,7 @@ def fixes_of(residuals: pd.DataFrame) -> Fixes | None:
     return Fixes(north["time"].to_numpy(float), position, north["weight"].to_numpy(float) > 0.0)
 
 
-SHOWN_HZ = 1.0  # of points on a map, unless told otherwise
+SHOWN_HZ = 1.0  # of points on a map, by default
 
 
 def point_table(track: Track) -> pd.DataFrame:

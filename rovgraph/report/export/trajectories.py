@@ -1,10 +1,12 @@
-"""TUM, for `evo_ape` and others: ``time x y z qx qy qz qw``, north, east, down.
+"""Trajectories for other programs: TUM, KITTI, SBET and NetCDF.
+
+TUM, for `evo_ape` and others: ``time x y z qx qy qz qw``, north, east, down.
 
 KITTI odometry poses, for `evo` and others: the first three rows of each pose's matrix, without time.
 
 SBET (Applanix), for survey software: binary records of 17 doubles, and the errors beside it as SMRMSG.
 
-NetCDF with the CF conventions for trajectories: everything that is known, with units and sds.
+NetCDF with the CF conventions for trajectories: all values, with units and sds.
 """
 
 from pathlib import Path
@@ -36,7 +38,7 @@ def write_kitti(track: Track, path: Path, options: ExportOptions) -> None:
 _KITTI = (ExportFormat("kitti", "KITTI poses", ".kitti.txt", write_kitti),)
 
 
-RATE = 100.0  # of records, unless told otherwise [Hz]
+RATE = 100.0  # of records, by default [Hz]
 NAMES = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
     "heading", "wander_angle", "x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate",

@@ -1,5 +1,6 @@
-"""Pages: what a results folder holds, as one HTML file that opens offline and answers the mouse.
+"""The page of a results folder: one HTML file that opens offline and is interactive.
 
-`reporting.write_page` makes ``report.html`` from a folder alone; `campaign.campaign_page` sets several dives side by
-side. A page is a list of `parts.Section`; ``assets/page.js`` draws them with Plotly when they come into view.
+May import what `rovgraph.report` may; the only package that imports jinja2. Begin with `reporting` (`write_page` makes
+``report.html`` from a folder alone) and `page` (a page is a list of `Section`). Each section of a dive's page is a
+module; ``assets/page.js`` draws them with Plotly when they come into view. `studies` has the pages of several dives.
 """

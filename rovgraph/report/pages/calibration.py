@@ -1,4 +1,4 @@
-"""Calibration: each variable against its prior, what is confused with what, what would help, and the biases."""
+"""Section on the calibration: each variable against its prior, confounded variables, remedies, and the biases."""
 
 from collections.abc import Sequence
 
@@ -67,7 +67,7 @@ def needs(label: str) -> str:
 
 
 def _words(joint: dict[str, list[float]]) -> list[str]:
-    """What cannot be told apart, in the words of ``rovgraph observe``."""
+    """Variables that cannot be separated, in the words of ``rovgraph observe``."""
     labels = [str(label) for label in joint["labels"]]
     prior, P = np.array(joint["prior_sd"], float), np.array(joint["covariance"], float)
     if not (np.isfinite(P).all() and np.isfinite(prior).all() and (prior > 0).all()):

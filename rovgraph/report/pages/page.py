@@ -1,8 +1,7 @@
-"""A page: sections to one HTML file, with everything in it.
+"""A page: sections of panels, tables and text, rendered to one HTML file with all its data.
 
-What a page is made of: sections of panels, tables and text, with arrays packed for the browser.
-
-Series thinned for display: of every stretch its extremes are kept, so that no peak is lost.
+Arrays are packed for the browser. Series are thinned for display: the extremes of every interval are kept, so that
+peaks stay visible.
 """
 
 import base64
@@ -93,7 +92,7 @@ class Panel:
     reach: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """What ``page.js`` draws."""
+        """Data for ``page.js``."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
         more = {"log": self.log, "names": [*self.names], "reach": self.reach}
@@ -231,7 +230,7 @@ def _environment() -> Environment:
 
 @cache
 def _asset(name: str) -> Markup:
-    """A file of ours that goes into the page as it is."""
+    """A file of this package that goes into the page unchanged."""
     return Markup((files("rovgraph.report.pages") / "assets" / name).read_text(encoding="utf-8"))
 
 

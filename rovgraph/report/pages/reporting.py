@@ -1,7 +1,4 @@
-"""The page of a results folder, whichever command made it.
-
-The page of a dive, from the results folder of ``rovgraph smooth``.
-"""
+"""The page of a results folder, whichever command made it: the sections of a dive's page, or those of `studies`."""
 
 from pathlib import Path
 

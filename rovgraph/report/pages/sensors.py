@@ -1,8 +1,7 @@
-"""Sensors: the DVL, every sensor's residuals, the compasses, clocks and gaps.
+"""Sections on the sensors: the DVL and its beams, every sensor's residuals, the compasses, clocks and gaps.
 
-The beams of the DVL against time: how many of their pings were valid, and how far they reached.
-
-Compasses: residual against heading with the fitted deviation curve, and two compasses against each other.
+The beams are drawn against time: how many of their pings were valid, and their range. Compasses: residual against
+heading with the fitted deviation curve, and two compasses against each other.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,7 @@
-"""A results folder, read back.
+"""Reads a results folder for its page, and makes the section on its origin.
 
-What a page was made of: configuration, versions, files with checksums, and the command to make it again.
-
-What pages of results folders share: their end, tables of CSV files, images, and numbers as text.
+That section has configuration, versions, files with checksums, and the command to make the folder again. `table_of`,
+`images`, `piece` and `cell` are shared by all pages: tables of CSV files, images, and numbers as text.
 """
 
 import hashlib
@@ -90,7 +89,7 @@ class ResultsSource:
         return f"The results were written by rovgraph {wrote}, this page by {__version__}; what is missing is named."
 
     def frame(self, name: str, *columns: str) -> pd.DataFrame | None:
-        """A CSV file of the folder; None where there is none.
+        """A CSV file of the folder; None if it is missing.
 
         Raises
         ------
@@ -112,12 +111,12 @@ class ResultsSource:
         return table
 
     def text(self, name: str) -> str | None:
-        """A text file of the folder; None where there is none."""
+        """A text file of the folder; None if it is missing."""
         path = self.folder / name
         return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
 
     def json(self, name: str) -> dict[str, Any] | None:
-        """A JSON file of the folder; None where there is none.
+        """A JSON file of the folder; None if it is missing.
 
         Raises
         ------
@@ -272,7 +271,7 @@ class DiveSource(ResultsSource):
 
     @cached_property
     def beams(self) -> Stream | None:
-        """What each beam of the DVL measured; None where the folder does not tell.
+        """Measurements of each beam of the DVL; None where the folder has none.
 
         Raises
         ------
@@ -329,7 +328,7 @@ def _files(source: ResultsSource) -> PageTable:
     if isinstance(log, dict):
         rows.append((f"{log.get('path')} (the log)", f"{log.get('bytes')}", str(log.get("sha256"))))
     for path in sorted(source.folder.iterdir()):
-        if path.is_file() and path.name not in (PAGE, SUMMARY):  # which says how long the work took
+        if path.is_file() and path.name not in (PAGE, SUMMARY):  # which holds the time that the work took
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             rows.append((path.name, str(path.stat().st_size), digest))
@@ -349,7 +348,7 @@ def rendered(source: ResultsSource, title: str, sections: Sequence[Section], clo
 
 
 def table_of(table: pd.DataFrame, title: str, names: dict[str, str], file: str) -> PageTable:
-    """Columns that have anything, under names a reader knows."""
+    """Columns with values, under readable names."""
     known = {column: name for column, name in names.items() if column in table and table[column].notna().any()}
     rows = [tuple(cell(v) for v in row) for row in table[[*known]].head(MOST_ROWS).itertuples(index=False)]
     some = f"The first {MOST_ROWS} of {len(table)} rows. " if len(table) > MOST_ROWS else ""
@@ -369,7 +368,7 @@ def piece(source: ResultsSource, name: str) -> Item:
 
 
 def cell(value: object) -> str:
-    """A value as text, "–" where there is none."""
+    """A value as text, "–" without a value."""
     if value is None or value != value:
         return "–"
     if isinstance(value, float):

@@ -1,8 +1,7 @@
-"""Pages of `observe`, `plan`, `calibrate` and `check`; and which page a results folder that is no dive's has.
+"""Pages of `compare`, `study`, `observe`, `plan`, `calibrate` and `check`, and of several dives side by side.
 
-Pages of `compare` and `study`: many dives, and how well each estimator or cell does on them.
-
-Several dives side by side: a table, a map of all, and how fast each lost its way.
+`compare` and `study` show how well each estimator or cell does on many dives. Dives side by side have a table, a map of
+all, and the growth of each one's error.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -160,7 +159,7 @@ def study_page(source: ResultsSource) -> str:
 
 
 def _that_differ(table: pd.DataFrame) -> dict[str, str]:
-    """Settings that tell the cells of a study apart: those before the count of its runs."""
+    """Settings that distinguish the cells of a study: those before the count of its runs."""
     settings = [*table.columns[1 : table.columns.get_loc("runs")]] if "runs" in table else []
     return {str(name): str(name).replace("_", " ") for name in settings if len(table[name].drop_duplicates()) > 1}
 
@@ -197,7 +196,7 @@ WORSE = 0.8  # of the scatter before, that is hardly less
 
 
 def study_page_of(source: ResultsSource) -> Callable[[ResultsSource], str] | None:
-    """What makes the page of a folder that is no dive's; None where there is none."""
+    """The function that makes the page of a folder without a dive; None if there is no such page."""
     summary = source.summary
     if summary.get("calibration") in ("noise", "magnetometer"):
         return noise_page if summary["calibration"] == "noise" else magnetometer_page
@@ -406,7 +405,7 @@ def campaign_page(folders: Sequence[Path]) -> str:
 
     Raises
     ------
-    InputError : one of them is none, or cannot be read
+    InputError : one of them is not a results folder, or cannot be read
     """
     with damage_named(*folders):
         dives = {name: _dive(folder) for name, folder in zip(_names(folders), folders, strict=True)}
@@ -424,12 +423,12 @@ def _dive(folder: Path) -> DiveSource:
     if "main_estimate" not in source.summary:
         raise InputError(f"{folder}: holds no results of rovgraph smooth; only dives are set side by side")
     dive = DiveSource(source.folder, source.summary)
-    _ = dive.main  # read it now, to say which folder cannot be read
+    _ = dive.main  # read it now, to name the folder that cannot be read
     return dive
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """What tells the folders apart: their own names, or their whole paths where these are the same."""
+    """Names that distinguish the folders: their own names, or their whole paths where these are the same."""
     short = [folder.resolve().name for folder in folders]
     return [
         s if short.count(s) == 1 else f"{folder} ({k + 1})"

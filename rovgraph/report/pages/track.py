@@ -1,4 +1,4 @@
-"""The track seen from above: estimates, fixes, ellipses, silences, and what the cursor needs to find the vehicle."""
+"""Section on the track, seen from above: estimates, fixes, ellipses, outages, and data for the cursor."""
 
 import html
 from typing import Any

@@ -1,4 +1,4 @@
-"""Standard deviations against time, what made them smaller, and the separation of filter and smoother."""
+"""Section on uncertainty: standard deviations against time, what reduced them, and filter against smoother."""
 
 from collections.abc import Callable
 

@@ -1,6 +1,6 @@
-"""The verdict in words for a person who knows nothing of filters: how good, what limits it, what to do next time.
+"""Section on the verdict, in plain words: how good the track is, what limits it, and what to do next time.
 
-Sources of variance in groups that a person can do something about.
+Sources of variance are grouped by what a person can change.
 """
 
 from collections.abc import Mapping
@@ -89,10 +89,10 @@ def largest_cause(sources: Mapping[str, float]) -> tuple[Cause, float] | None:
     return (cause, found[cause] / total) if found[cause] > 0 else None
 
 
-ALIKE = 0.97  # a radius at the end of this part of the largest is said once
+ALIKE = 0.97  # a radius at the end of this part of the largest is stated once
 LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
 MOST = 0.5  # of the variance: where that much is older than the way since the last fix, the way is not what limits
-SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
+SHORT = 0.2  # displacement, as a part of the distance, below which directions mean little
 
 GOOD = {
     "trusted": "Nothing in the log contradicts this track.",
