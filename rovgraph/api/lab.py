@@ -94,8 +94,34 @@ SEEDS = range(1, 31)
 THESIS = "vattern"  # the scenario of the thesis, whose numbers are shown beside ours
 
 
+class LabResult:
+    """What a command of the lab found; it can be saved as a results folder."""
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of the command, with its page, complete or not at all.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written; it holds an input
+        """
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.pages.reporting import write_page
+
+        with results_folder(as_path(path, "path"), force, self._inputs) as folder:
+            self._write(folder)
+            write_page(folder)
+
+    def _write(self, folder: Path) -> None:
+        raise NotImplementedError
+
+    @property
+    def _inputs(self) -> list[Path]:
+        """Files that the folder must not replace."""
+        return []
+
+
 @dataclass(frozen=True)
-class ComparisonResult:
+class ComparisonResult(LabResult):
     """Errors, consistency and cost of each estimator.
 
     Attributes
@@ -116,22 +142,13 @@ class ComparisonResult:
         """A row per estimator."""
         return self.comparison.table
 
-    def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph compare`` (docs/compare.md), complete or not at all.
-
-        Raises
-        ------
-        InputError : the folder exists and ``force`` is not given, or cannot be written
-        """
+    def _write(self, folder: Path) -> None:
+        """The files of ``rovgraph compare`` (docs/compare.md)."""
         from rovgraph.report.figures_lab import draw_comparison
-        from rovgraph.report.folder import results_folder
         from rovgraph.report.lab import write_comparison
-        from rovgraph.report.pages.reporting import write_page
 
-        with results_folder(as_path(path, "path"), force) as folder:
-            draw_comparison(folder, self.comparison, self.title, self.thesis)
-            write_comparison(folder, self.comparison, self.about)
-            write_page(folder)
+        draw_comparison(folder, self.comparison, self.title, self.thesis)
+        write_comparison(folder, self.comparison, self.about)
 
 
 def compare(
@@ -222,7 +239,7 @@ USUAL = SensorRates()
 
 
 @dataclass(frozen=True)
-class ObservabilityResult:
+class ObservabilityResult(LabResult):
     """The observability of the calibration in a dive.
 
     Attributes
@@ -243,26 +260,17 @@ class ObservabilityResult:
         """Label of each component -> observable, weak or unobservable."""
         return dict(zip(self.observability.labels, self.observability.verdicts, strict=True))
 
-    def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph observe`` (docs/observability.md), complete or not at all.
-
-        Raises
-        ------
-        InputError : the folder exists and ``force`` is not given, or cannot be written
-        """
+    def _write(self, folder: Path) -> None:
+        """The files of ``rovgraph observe`` (docs/observability.md)."""
         from rovgraph.report.figures_lab import draw_observability
-        from rovgraph.report.folder import results_folder
         from rovgraph.report.lab import write_observability
-        from rovgraph.report.pages.reporting import write_page
 
-        with results_folder(as_path(path, "path"), force) as folder:
-            draw_observability(folder, self.observability)
-            write_observability(folder, self.observability, self.config, self.about)
-            write_page(folder)
+        draw_observability(folder, self.observability)
+        write_observability(folder, self.observability, self.config, self.about)
 
 
 @dataclass(frozen=True)
-class PlanResult:
+class PlanResult(LabResult):
     """Manoeuvres, ranked by the information they would add.
 
     Attributes
@@ -276,22 +284,13 @@ class PlanResult:
     config: Config
     about: Mapping[str, Any]
 
-    def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph plan`` (docs/observability.md), complete or not at all.
-
-        Raises
-        ------
-        InputError : the folder exists and ``force`` is not given, or cannot be written
-        """
+    def _write(self, folder: Path) -> None:
+        """The files of ``rovgraph plan`` (docs/observability.md)."""
         from rovgraph.report.figures_lab import draw_plan
-        from rovgraph.report.folder import results_folder
         from rovgraph.report.lab import write_plan
-        from rovgraph.report.pages.reporting import write_page
 
-        with results_folder(as_path(path, "path"), force) as folder:
-            draw_plan(folder, self.plan)
-            write_plan(folder, self.plan, self.config, self.about)
-            write_page(folder)
+        draw_plan(folder, self.plan)
+        write_plan(folder, self.plan, self.config, self.about)
 
 
 def observe(
@@ -365,7 +364,7 @@ def plan(
 
 
 @dataclass(frozen=True)
-class MagnetometerResult:
+class MagnetometerResult(LabResult):
     """Hard and soft iron of a magnetometer.
 
     Attributes
@@ -377,24 +376,19 @@ class MagnetometerResult:
     found: MagnetometerCalibration
     config: Config
 
-    def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph calibrate magnetometer`` (docs/calibration.md), complete or not at all.
-
-        Raises
-        ------
-        InputError : the folder exists and ``force`` is not given, or cannot be written
-        """
+    def _write(self, folder: Path) -> None:
+        """The files of ``rovgraph calibrate magnetometer`` (docs/calibration.md)."""
         from rovgraph.report.calibrations import write_magnetometer
-        from rovgraph.report.folder import results_folder
-        from rovgraph.report.pages.reporting import write_page
 
-        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
-            write_magnetometer(folder, self.found, self.config)
-            write_page(folder)
+        write_magnetometer(folder, self.found, self.config)
+
+    @property
+    def _inputs(self) -> list[Path]:
+        return [Path(self.found.source)]
 
 
 @dataclass(frozen=True)
-class NoiseResult:
+class NoiseResult(LabResult):
     """Noise of the sensors at rest.
 
     Attributes
@@ -406,20 +400,15 @@ class NoiseResult:
     found: NoiseReport
     config: Config
 
-    def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph calibrate noise`` (docs/calibration.md), complete or not at all.
-
-        Raises
-        ------
-        InputError : the folder exists and ``force`` is not given, or cannot be written
-        """
+    def _write(self, folder: Path) -> None:
+        """The files of ``rovgraph calibrate noise`` (docs/calibration.md)."""
         from rovgraph.report.calibrations import write_noise
-        from rovgraph.report.folder import results_folder
-        from rovgraph.report.pages.reporting import write_page
 
-        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
-            write_noise(folder, self.found, self.config)
-            write_page(folder)
+        write_noise(folder, self.found, self.config)
+
+    @property
+    def _inputs(self) -> list[Path]:
+        return [Path(self.found.source)]
 
 
 def calibrate_magnetometer(
