@@ -17,6 +17,7 @@ from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import matrix_from_rpy
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.sources.json_lines import json_lines
+from rovgraph.log import tables as log_tables
 from rovgraph.log.units import turn_angles
 from rovgraph.report.export import Track
 from rovgraph.report.export import tag as tag_table
@@ -479,3 +480,26 @@ def test_a_guess_reads_an_excel_table_as_its_log(tmp_path):
         warnings.simplefilter("ignore")
         log = rg.read_log(path, guess.config.changed(environment={"origin_lat_deg": 54.3, "origin_lon_deg": 10.15}))
     is_true(log)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"a,b\n1,2\n3,4\n", 3),
+        (b"a,b\n1,2\n3,4", 3),
+        (b"a,b\n,\n", 2),
+        (b"a,b\n\n1,2\n", None),
+        (b"a,b\n1,2\n\n", None),
+        (b"a,b\n1,2,3\n", None),
+        (b"a,b\n1\n", None),
+        (b'a,b\n"1,0",2\n', None),
+    ],
+)
+@pytest.mark.parametrize("block", [1, 5, 1 << 24])
+def test_lines_are_counted_at_once_where_all_have_the_cells_of_the_header(content, expected, block, monkeypatch):
+    monkeypatch.setattr(log_tables, "BLOCK", block)
+    assert log_tables._even_lines(content, 2, b",") == expected
+    if expected is not None:
+        slow = [bool(line.strip()) for line in content.splitlines()]
+        filled, odd = log_tables._filled(content, 2, b",", 2)
+        assert odd is None and filled.tolist() == slow[1:]

@@ -30,6 +30,7 @@ _TIMES = "dates", "durations"
 GZIP = b"\x1f\x8b"
 LONGEST_HEADER = 1 << 20  # bytes of the first line
 HEAD = 1 << 16  # bytes by which a layout is found
+BLOCK = 1 << 24  # bytes of which lines are counted at a time
 SUFFIXES = (".csv.gz", ".csv", ".parquet")  # of a log that is written
 WIDE_ROWS = 0.9  # of the rows below the first that is longer than the header, which are as long
 SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas"}
@@ -560,6 +561,8 @@ class _Odd:
 
 def _filled(content: bytes, width: int, separator: bytes, first: int) -> tuple[NDArray[np.bool_], _Odd | None]:
     """Which lines below the header are not blank, and those that have not as many cells as the header."""
+    if (lines := _even_lines(content, width, separator)) is not None:
+        return np.ones(max(lines - first + 1, 0), np.bool_), None
     filled, odd = bytearray(), None
     for number, line in enumerate(_lines(content), 1):
         has_cells = bool(line.strip())
@@ -575,6 +578,20 @@ def _filled(content: bytes, width: int, separator: bytes, first: int) -> tuple[N
         elif odd is not None and has_cells:
             odd.others += 1
     return np.frombuffer(filled, np.bool_)[first - 1 :], odd
+
+
+def _even_lines(content: bytes, width: int, separator: bytes) -> int | None:
+    """How many lines there are, where each of them has the header's number of cells and none is blank; else None."""
+    lines = begin = 0
+    while begin < len(content):
+        end = content.find(b"\n", begin + BLOCK) + 1 or len(content)
+        block = np.frombuffer(content, np.uint8, end - begin, begin)
+        starts = np.concatenate([[0], np.flatnonzero(block[:-1] == ord("\n")) + 1])
+        separators = np.add.reduceat(block == ord(separator), starts, dtype=np.int32)
+        if (separators != width - 1).any() or not np.logical_or.reduceat(block > ord(" "), starts).all():
+            return None
+        lines, begin = lines + len(starts), end
+    return lines
 
 
 def _with_decimals_of_seconds(text: bytes, odd: _Odd) -> bytes | None:
