@@ -425,7 +425,7 @@ def _window(
     stops[count] = start
     stops, motion, snapshots = np.sort(stops), row.copy(), np.empty((count + 1, NUMBERS))
     integrate(imu, begin, end, stops, motion, np.empty((MOTION, MOTION)), snapshots)
-    own = snapshots[first_not_before_in(stops, start)]
+    at_start = snapshots[first_not_before_in(stops, start)]
     angle = np.zeros((len(imu), 3))
     for k in range(1, len(imu)):
         for i in range(3):
@@ -433,16 +433,16 @@ def _window(
     wide, narrow = np.empty(3), np.empty(3)
     for k in range(count):
         knot, out = snapshots[first_not_before_in(stops, stamp - lag[k])], window_out[k]
-        dt = knot[0] - own[0]
+        dt = knot[0] - at_start[0]
         out[0] = dt
         for i in range(3):
             out[10 + i] = out[13 + i] = 0.0
             for j in range(3):
                 out[1 + 3 * i + j] = 0.0
                 for m in range(3):  # into the keyframe's axes
-                    out[1 + 3 * i + j] += own[1 + 3 * m + i] * knot[1 + 3 * m + j]
-                out[10 + i] += own[1 + 3 * j + i] * (knot[10 + j] - own[10 + j])
-                out[13 + i] += own[1 + 3 * j + i] * (knot[13 + j] - own[13 + j] - dt * own[10 + j])
+                    out[1 + 3 * i + j] += at_start[1 + 3 * m + i] * knot[1 + 3 * m + j]
+                out[10 + i] += at_start[1 + 3 * j + i] * (knot[10 + j] - at_start[10 + j])
+                out[13 + i] += at_start[1 + 3 * j + i] * (knot[13 + j] - at_start[13 + j] - dt * at_start[10 + j])
         _mean_rate(imu, angle, stamp - lag[k], KNOT_WINDOW_S, wide)
         _mean_rate(imu, angle, stamp - lag[k], 0.5 * KNOT_WINDOW_S, narrow)
         for i in range(3):
@@ -571,18 +571,18 @@ def _take(
 
     ``here`` = it is at keyframe k, and not between it and the one before.
     """
-    imu, counts, own = streams.imu, dive.counts, streams.sensors[int(event[SENSOR])]
-    keyframe, m, dim = dive.keyframes[k], counts[ROWS], int(own[DIM])
+    imu, counts, sensor = streams.imu, dive.counts, streams.sensors[int(event[SENSOR])]
+    keyframe, m, dim = dive.keyframes[k], counts[ROWS], int(sensor[DIM])
     start = keyframe[TIME] if here else dive.keyframes[k - 1, TIME]
     before = keyframe[TIME] if k == 0 else dive.keyframes[k - 1, TIME]
     every = imu[_first_covering(imu, before, rule.around) : int(keyframe[COUNT]) - counts[FORGOTTEN]]
     window, number, longest_step = -1, -1, _longest_step(streams.steps, int(keyframe[COUNT]))
-    if own[LAG] >= 0:
+    if sensor[LAG] >= 0:
         window = counts[WINDOWS]
-        lag = integration.lags[own[LAG]]
+        lag = integration.lags[sensor[LAG]]
         if not _window(every, event[STAMP], lag, start, longest_step, integration.row, dive.windows[window]):
             return BEYOND
-    if own[SIGHTS] != 0:
+    if sensor[SIGHTS] != 0:
         if _in_view(dive, rule, m, event[NAME], event[PLACED]):
             return IN_VIEW
         number = int(keyframe[SIGHTED]) + 1
@@ -596,14 +596,14 @@ def _take(
     for i in range(6):
         row[ASSUMED + i] = integration.row[motion_row.BIAS + i]
     for i in range(dim):
-        if own[SIGHTS] == 0:
+        if sensor[SIGHTS] == 0:
             row[Z + i] = event[VALUES + i]
         row[Z + max(dim, MOST) + i] = event[VALUES + most + i]
     if here:
         for i in range(3):
             row[RATE + i] = keyframe[RATE_B + i]
         row[RATE_SD] = keyframe[SPREAD]
-    elif own[TURNED] != 0:
+    elif sensor[TURNED] != 0:
         if rule.without_imu != 0.0:
             row[RATE_SD] = rule.rate_sd
         else:

@@ -122,12 +122,12 @@ def kernel(signature: str | None = None, by_address: bool = False) -> Callable[[
 
     def decorate(function: F) -> F:
         options = _compilation().called_kernel if by_address else _compilation().kernel
-        folder, own = cache_folder(function.__module__), signature or signature_of(function)
+        folder, call_signature = cache_folder(function.__module__), signature or signature_of(function)
         try:
             with _cache_in(folder):
-                compiled = njit(own, cache=folder is not None, **options)(function)
+                compiled = njit(call_signature, cache=folder is not None, **options)(function)
         except OSError:  # the folder went away, or the disk is full
-            compiled = njit(own, **options)(function)
+            compiled = njit(call_signature, **options)(function)
         except numba.core.errors.NumbaError as error:
             raise InputError(
                 f"numba {numba.__version__} cannot compile {function.__name__} ({_first_line(error)}): "
@@ -348,8 +348,8 @@ def _writable(folder: Path) -> bool:
 @cache
 def _state_of(module: str) -> str:
     """A digest of a module, of all kernels that it imports, and of what compiles them."""
-    own = "" if module == "compilers" or _compilation().helper is not KERNEL else "as numba does"
-    digest = hashlib.sha256(f"{__version__} {numba.__version__} {sys.version}{own}".encode())
+    compiler = "" if module == "compilers" or _compilation().helper is not KERNEL else "as numba does"
+    digest = hashlib.sha256(f"{__version__} {numba.__version__} {sys.version}{compiler}".encode())
     for name in sorted(_imported_kernels(module.rpartition(".")[2])):
         digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
     return digest.hexdigest()[:16]
@@ -361,8 +361,8 @@ def _imported_kernels(name: str) -> frozenset[str]:
     path = Path(__file__).parent / f"{name}.py"
     if not path.exists():  # a kernel of somebody else's
         return frozenset()
-    own = set(re.findall(r"^ *from rovgraph\.kernels\.(\w+) import", path.read_text(encoding="utf-8"), re.MULTILINE))
-    return frozenset({name}).union(*(_imported_kernels(other) for other in own))
+    names = set(re.findall(r"^ *from rovgraph\.kernels\.(\w+) import", path.read_text(encoding="utf-8"), re.MULTILINE))
+    return frozenset({name}).union(*(_imported_kernels(other) for other in names))
 
 
 @contextlib.contextmanager

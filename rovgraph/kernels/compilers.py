@@ -49,8 +49,8 @@ class KernelLibrary(JITCodeLibrary):
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
         """As numba's, with the kernel and its wrappers in name only: it asks whether they are there."""
         name, kind, (machine_code, code) = cast(Any, super()).serialize_using_object_code()
-        own = f"{len(name)}{name}B"  # as mangled
-        names = [f.name for f in parse_bitcode(code).functions if own in f.name and not f.is_declaration]
+        mangled = f"{len(name)}{name}B"
+        names = [f.name for f in parse_bitcode(code).functions if mangled in f.name and not f.is_declaration]
         empty = "".join(f'define void @"{each}"() {{ ret void }}\n' for each in names)
         return name, kind, (machine_code, parse_assembly(empty).as_bitcode() if names else code)
 

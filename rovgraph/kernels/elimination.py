@@ -125,7 +125,7 @@ def eliminate_dive(
     for k in range(n):
         most = max(most, given_first[k + 1] - given_first[k] + MOST * (first[k + 1] - first[k]))
     room, last, stop = make_room(d, len(out.border), most, border_rows), len(out.border) + len(border_rows), 0
-    scratch, own = make_scratch(size, column), np.empty(MOST)
+    scratch, r = make_scratch(size, column), np.empty(MOST)
     moving, unwhitened, A = make_residual_scratch(), np.empty((MOTION, WIDTH)), np.empty((MOTION, WIDTH))
     C, targets, bias = np.zeros((MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
     for i in range(len(targets)):
@@ -133,7 +133,7 @@ def eliminate_dive(
     out.left[0], dense = 0.0, 0
     for k in range(n):
         end = load_measurements(k, given, MOTION, d, room)
-        end = load_linearized(k, end, point, dive, entered, room, scratch, own)
+        end = load_linearized(k, end, point, dive, entered, room, scratch, r)
         last, stop, failing = absorb(k, n, end, last, stop, room, out)
         if k < n - 1:
             for i in range(6):

@@ -38,7 +38,7 @@ MOVED = 9  # components that the motion mixes: rotation, position, velocity; bia
 def carry(P: Array, F: Array, Q: Array) -> None:
     """P <- F P F' + Q, F the unit matrix but for its first rows and its diagonal; P stays symmetric."""
     n = len(P)
-    FP, own = np.zeros((MOVED, n)), np.empty(MOVED)
+    FP, row = np.zeros((MOVED, n)), np.empty(MOVED)
     for i in range(MOVED):
         for j in range(n):
             share = F[i, j]
@@ -53,9 +53,9 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             total = 0.0
             for j in range(n):
                 total += FP[i, j] * F[k, j]
-            own[k] = total
+            row[k] = total
         for k in range(i + 1):
-            P[i, k] = P[k, i] = own[k]
+            P[i, k] = P[k, i] = row[k]
     for i in range(MOVED, n):
         if F[i, i] != 1.0:
             for k in range(n):
@@ -68,15 +68,15 @@ def carry(P: Array, F: Array, Q: Array) -> None:
 
 
 @view_helper
-def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
-    """B <- F B + F_y, ``moved`` being the rows of F_y that are not zero; ``own`` (MOVED,) is to calculate with."""
+def carry_considered(B: Array, F: Array, moved: Array, work: Array) -> None:
+    """B <- F B + F_y, ``moved`` being the rows of F_y that are not zero; ``work`` (MOVED,) is to calculate with."""
     for k in range(B.shape[1]):
         for i in range(MOVED):
-            own[i] = moved[i, k]
+            work[i] = moved[i, k]
             for j in range(len(B)):
-                own[i] += F[i, j] * B[j, k]
+                work[i] += F[i, j] * B[j, k]
         for i in range(MOVED):
-            B[i, k] = own[i]
+            B[i, k] = work[i]
         for i in range(MOVED, len(B)):
             B[i, k] *= F[i, i]
 
@@ -113,30 +113,30 @@ def predict_filter(
     for i in range(estimated):
         Q_out[i, i] = walk[0, i] * motion[DURATION]
     for i in range(MOTION, len(column)):
-        own = column[i]
-        if 0 <= own < estimated and walk[1, own] > 0.0:
-            rate = walk[1, own]
+        index = column[i]
+        if 0 <= index < estimated and walk[1, index] > 0.0:
+            rate = walk[1, index]
             keep = math.exp(-rate * motion[DURATION])
-            F_out[own, own] = keep
-            Q_out[own, own] = walk[0, own] * (1.0 - keep * keep) / (2.0 * rate)
-            c[i - MOTION] = walk[2, own] + keep * (c[i - MOTION] - walk[2, own])
+            F_out[index, index] = keep
+            Q_out[index, index] = walk[0, index] * (1.0 - keep * keep) / (2.0 * rate)
+            c[i - MOTION] = walk[2, index] + keep * (c[i - MOTION] - walk[2, index])
     for i in range(MOTION):
         for j in range(MOTION):
             F_out[i, j] = F[i, j]
             Q_out[i, j] += Q[i, j]
     if len(scale):
         for k in range(6):
-            own = column[MOTION + ACC_SCALE + k]
-            if own >= 0:  # a scale moves the state as the bias does that it makes, but not the bias itself
+            index = column[MOTION + ACC_SCALE + k]
+            if index >= 0:  # a scale moves the state as the bias does that it makes, but not the bias itself
                 for i in range(MOVED):
                     by = 0.0
                     for j in range(6):
                         by += F[i, MOVED + j] * scale[j, k]
-                    if own < estimated:
-                        F_out[i, own] += by
+                    if index < estimated:
+                        F_out[i, index] += by
                     else:
                         for j in range(len(L)):
-                            moved[i, j] += by * L[own - estimated, j]
+                            moved[i, j] += by * L[index - estimated, j]
     carry(P, F_out, Q_out)
     if len(L):
         carry_considered(B, F_out, moved, np.empty(MOVED))

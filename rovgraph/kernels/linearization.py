@@ -226,8 +226,8 @@ def make_scratch(calibration_size: int, column: Index) -> LinearizationScratch:
     there = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty((4, 3))
     work = np.empty((PREDICT_WORK, 3, 3)), np.empty((WORK, 3, 3))
     late, estimated = (np.empty(KNOT), np.empty((4, 3, 3))), (used[:count].copy(), columns[:count].copy())
-    own = np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST))
-    return LinearizationScratch(*own, *there, F, *late, *work, *estimated, np.empty((0, 0)))
+    innovation = np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST))
+    return LinearizationScratch(*innovation, *there, F, *late, *work, *estimated, np.empty((0, 0)))
 
 
 @helper
@@ -290,12 +290,12 @@ def place(state: Epoch, one: Measured, gravity: float, derive: bool, scratch: Li
         return False
     dt, dR, dv, dp = row[DT], row[DR:DV].reshape(3, 3), row[DV:DP], row[DP:ASSUMED]
     if late:
-        own = scratch.knot
-        _interpolate(one.window, state.c[int(one.sensor[OFFSET])], own, scratch.by_offset, scratch.placing)
-        dt, dR = own[KNOT_DT], own[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3)
-        dv, dp = own[KNOT_DT + 10 : KNOT_DT + 13], own[KNOT_DT + 13 : KNOT_DT + 16]
+        knot = scratch.knot
+        _interpolate(one.window, state.c[int(one.sensor[OFFSET])], knot, scratch.by_offset, scratch.placing)
+        dt, dR = knot[KNOT_DT], knot[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3)
+        dv, dp = knot[KNOT_DT + 10 : KNOT_DT + 13], knot[KNOT_DT + 13 : KNOT_DT + 16]
         for i in range(3):
-            scratch.rate[i] = own[KNOT_RATE + i]
+            scratch.rate[i] = knot[KNOT_RATE + i]
     assumed, seen = row[ASSUMED : ASSUMED + 6], Epoch(state.R, state.p, state.v, bias, state.c)
     there = Epoch(scratch.R, scratch.p, scratch.v, bias, state.c)
     propagate(seen, Snapshot(dt, dR, dv, dp, assumed), gravity, there, scratch.moving)
@@ -401,10 +401,10 @@ def linearize_measurement(
             r_out[a] += W[a, k] * z[k]
         square += r_out[a] * r_out[a]
     for u in range(len(scratch.used)):
-        j, own = scratch.used[u], scratch.column[u]
+        j, column = scratch.used[u], scratch.column[u]
         for a in range(int(one.sensor[DIM])):
             for k in range(a + 1):
-                H_out[a, own] += W[a, k] * H[k, j]
+                H_out[a, column] += W[a, k] * H[k, j]
     return square
 
 

@@ -67,8 +67,8 @@ class ResidualScratch(NamedTuple):
 def make_residual_scratch() -> ResidualScratch:
     """Arrays for all motions of a dive; made once."""
     there = Epoch(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(6), np.empty(0))
-    own = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
-    return ResidualScratch(make_motion_scratch(), there, *own, np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)))
+    between = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    return ResidualScratch(make_motion_scratch(), there, *between, np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)))
 
 
 @helper
@@ -218,8 +218,8 @@ def motion_residuals(motions: Matrix, W: Matrices, states: States, shift: Matrix
     for k in range(len(motions)):
         before, after = epoch(states, k), epoch(states, k + 1)
         for i in range(6):
-            own = shift[k, i] if len(shift) else 0.0
-            b_i[i], b_j[i] = before.b[i] + own, after.b[i] + own
+            by_scale = shift[k, i] if len(shift) else 0.0
+            b_i[i], b_j[i] = before.b[i] + by_scale, after.b[i] + by_scale
             r[9 + i] = b_i[i] - b_j[i]
         before, after = with_bias(before, b_i), with_bias(after, b_j)
         if is_coasted(motions[k]):
