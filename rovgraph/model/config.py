@@ -293,13 +293,13 @@ class Config(ConfigSection):
         online = data.get("online") if isinstance(data, dict) else None
         if not isinstance(online, dict) or "delay_s" not in online:
             return data
-        rest, former, own = dict(online), online["delay_s"] or {}, data.get("delay_s") or {}
+        rest, former, delays = dict(online), online["delay_s"] or {}, data.get("delay_s") or {}
         del rest["delay_s"]
-        if not isinstance(former, dict) or not isinstance(own, dict):
-            return data | {"online": rest, "delay_s": former if isinstance(own, dict) else own}
-        if twice := sorted(map(str, former.keys() & own.keys())):
+        if not isinstance(former, dict) or not isinstance(delays, dict):
+            return data | {"online": rest, "delay_s": former if isinstance(delays, dict) else delays}
+        if twice := sorted(map(str, former.keys() & delays.keys())):
             raise PydanticCustomError("stated_twice", f"delay_s and online.delay_s both name {twice[0]}; state it once")
-        return data | {"online": rest, "delay_s": {**former, **own}}
+        return data | {"online": rest, "delay_s": {**former, **delays}}
 
     @property
     def table(self) -> TableSettings:
@@ -316,8 +316,8 @@ class Config(ConfigSection):
         fitting = [pattern for pattern in self.files if fits(path, pattern)]
         if len(fitting) > 1:
             raise InputError(f"{path}: files: both {fitting[0]!r} and {fitting[1]!r} fit it; state one of them")
-        own = self.files[fitting[0]].model_dump(exclude_unset=True) if fitting else {}
-        return FileSettings.model_validate(merged(self.table.model_dump(), own))
+        of_pattern = self.files[fitting[0]].model_dump(exclude_unset=True) if fitting else {}
+        return FileSettings.model_validate(merged(self.table.model_dump(), of_pattern))
 
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""

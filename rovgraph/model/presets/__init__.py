@@ -155,7 +155,7 @@ def _without(data: dict[str, Any], path: list[str], value: Any) -> dict[str, Any
         return data
     if rest:
         return {**data, head: _without(data[head], rest, value)}
-    return {key: own for key, own in data.items() if key != head or own != value}
+    return {key: entry for key, entry in data.items() if key != head or entry != value}
 
 
 def _named(section: Mapping[str, Any]) -> bool:
