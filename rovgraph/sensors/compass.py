@@ -56,8 +56,8 @@ class CompassHeading:
         """Declination, places of offset, curve and error (or -1) in the calibration vector, the x axis in b."""
         declination = np.atleast_1d(self.declination)
         error = -1 if self.error is None else LAYOUT[self.error].start
-        own = LAYOUT[self.offset].start, LAYOUT[self.curve].start, error, *self.R_bs[:, 0]
-        return np.column_stack([declination, np.tile(own, (len(declination), 1))])
+        constants = LAYOUT[self.offset].start, LAYOUT[self.curve].start, error, *self.R_bs[:, 0]
+        return np.column_stack([declination, np.tile(constants, (len(declination), 1))])
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)

@@ -26,8 +26,8 @@ def heading_sources(config: Config, available: set[str]) -> list[str]:
     if config.heading.sources is not None:
         wanted = [s for s in HEADING_STREAMS if SENSORS[s].heading_source in config.heading.sources]
     else:
-        own = [s for s in ("mag", "ahrs", "vehicle_heading") if s in available]
-        wanted = [*own[:1], "dvl_heading"]
+        of_vehicle = [s for s in ("mag", "ahrs", "vehicle_heading") if s in available]
+        wanted = [*of_vehicle[:1], "dvl_heading"]
     return [s for s in HEADING_STREAMS if s in wanted and s in available]
 
 

@@ -109,7 +109,7 @@ def evaluate(model: CompiledModel, by_state: tuple[str, ...], state: State, rate
     z, H = np.empty((n, model.dim)), np.empty((n, model.dim, len(columns)))
     R, p, v, b, c, rate, packed = (np.require(values, float, ("C", "W")) for values in given)
     kernels.predict_many(model.kind, States(R, p, v, b, c), rate, packed, columns, z, H)
-    return z, {name: H[..., own] for name, own in parts}
+    return z, {name: H[..., part] for name, part in parts}
 
 
 _STATE = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
@@ -126,9 +126,9 @@ def _columns(
 ) -> tuple[NDArray[np.int64], list[tuple[str, slice]]]:
     """Columns of all variables in a kernel's Jacobian, and the part of them that each variable has."""
     columns = [np.arange(_STATE[name].start, _STATE[name].stop) for name in by_state]
-    columns += [MOTION + np.arange(own.start, own.stop) for own in (_place(name, size) for name in names)]
-    ends = np.cumsum([len(own) for own in columns]).tolist()
-    parts = [slice(end - len(own), end) for own, end in zip(columns, ends, strict=True)]
+    columns += [MOTION + np.arange(place.start, place.stop) for place in (_place(name, size) for name in names)]
+    ends = np.cumsum([len(of_variable) for of_variable in columns]).tolist()
+    parts = [slice(end - len(of_variable), end) for of_variable, end in zip(columns, ends, strict=True)]
     return np.concatenate(columns), list(zip((*by_state, *names), parts, strict=True))
 
 

@@ -111,8 +111,8 @@ class Instrument:
     @property
     def calibration(self) -> tuple[str, ...]:
         """Calibration variables that its measurements depend on."""
-        own = self.model.calibration
-        return own if self.time_offset is None else (*own, self.time_offset)
+        of_model = self.model.calibration
+        return of_model if self.time_offset is None else (*of_model, self.time_offset)
 
 
 class Limits(Protocol):
@@ -161,8 +161,8 @@ def own_sd(column: int) -> Callable[[Array, Instrument, Config], Array]:
     """A measurement's own standard deviation, in a column of its stream, where it is known."""
 
     def standard_deviation(values: Array, believed: Instrument, config: Config) -> Array:
-        own = float(values[column])
-        return np.full(len(believed.sd), min(own, LARGEST_SD)) if own > 0.0 else believed.sd
+        sd = float(values[column])
+        return np.full(len(believed.sd), min(sd, LARGEST_SD)) if sd > 0.0 else believed.sd
 
     return standard_deviation
 
@@ -302,5 +302,5 @@ def unregister(name: str) -> None:
 
 def settings(config: Config, sensor: str) -> SensorSettings:
     """Section of a configuration on a registered sensor."""
-    own: SensorSettings = getattr(config.sensors, sensor)
-    return own
+    section: SensorSettings = getattr(config.sensors, sensor)
+    return section
