@@ -40,7 +40,7 @@ def beams_of(table: Table) -> Stream:
     InputError : no time, no beam, more than `MOST_BEAMS`, quantities of different beams, or cells that cannot be used
     """
     columns, numbers = _columns(table)
-    cells = {what: np.column_stack([table.numbers(name) for name in own]) for what, own in columns.items()}
+    cells = {what: np.column_stack([table.numbers(name) for name in headers]) for what, headers in columns.items()}
     time = table.numbers("time")
     order = np.argsort(time, kind="stable")
     order = order[np.isfinite(time[order])]
@@ -112,7 +112,7 @@ def _columns(table: Table) -> tuple[dict[str, list[str]], list[int]]:
             )
     if len(numbers) > MOST_BEAMS:
         raise InputError(f"{table.source}: has {len(numbers)} beams, expected at most {MOST_BEAMS}")
-    return {what: [own[k] for k in numbers] for what, own in found.items()}, numbers
+    return {what: [by_number[k] for k in numbers] for what, by_number in found.items()}, numbers
 
 
 def _valid(cells: Mapping[str, Array], columns: Mapping[str, list[str]], table: Table) -> NDArray[np.bool_]:

@@ -33,7 +33,7 @@ def write_csv(
     decimals : column -> digits after the point, of columns of floats that are all known
     """
     fixed = {name: f"%.{count}f" for name, count in (decimals or {}).items()}
-    columns = {str(name): np.asarray(own) for name, own in table.items()}
+    columns = {str(name): np.asarray(values) for name, values in table.items()}
     holey = {name: bool(np.isnan(column).any()) for name, column in columns.items() if column.dtype.kind == "f"}
     formats = [fixed.get(name) or _format(column, holey.get(name, False), digits) for name, column in columns.items()]
     if None in formats or path.suffix != ".csv":
@@ -41,7 +41,7 @@ def write_csv(
         frame = frame.assign(**{name: frame[name].map(form.__mod__) for name, form in fixed.items()})
         frame.to_csv(path, mode="a" if append else "w", header=not append, index=False, float_format=f"%.{digits}g")
         return
-    row = ",".join(str(own) for own in formats) + "\n"
+    row = ",".join(str(cell_format) for cell_format in formats) + "\n"
     with path.open("a" if append else "w", encoding="utf-8", newline="") as file:
         if not append:
             file.write(",".join(columns) + "\n")
@@ -119,7 +119,7 @@ def _text(
     lines, count = [], sum(len(place) for place, _ in sets)
     which, width = np.empty(count, np.int64), np.empty(count, np.int64)
     for k, (place, columns) in enumerate(sets):
-        lines.append(",".join(own if name in columns else "" for name, own in form.items()) + "\n")
+        lines.append(",".join(cell_format if name in columns else "" for name, cell_format in form.items()) + "\n")
         which[place], width[place] = k, len(columns)
     first = np.cumsum(width) - width  # of a row's numbers among all
     numbers = np.empty(int(width.sum()))

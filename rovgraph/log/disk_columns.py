@@ -156,11 +156,11 @@ def taken(values: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(values[rows])
     out = GrowingColumn(values.dtype)
     if rows.dtype == bool:
-        for piece, own in in_pieces(values, rows):
-            out.extend(piece[own].ravel())
+        for piece, chosen in in_pieces(values, rows):
+            out.extend(piece[chosen].ravel())
     else:
-        for (own,) in in_pieces(rows):
-            out.extend(values[own].ravel())
+        for (chosen,) in in_pieces(rows):
+            out.extend(values[chosen].ravel())
             release(values)
     return out.array().reshape(-1, *values.shape[1:])
 
@@ -174,7 +174,7 @@ def steps(values: NDArray[Any], found: Callable[[NDArray[Any]], NDArray[np.bool_
     """Rows whose difference from the row before, perhaps NaN, is such, by their indices."""
     with np.errstate(invalid="ignore"):  # between infinite values
         rows = [np.flatnonzero(found(np.diff(piece))) for (piece,) in in_pieces(values, beyond=1)]
-    return np.concatenate([np.empty(0, np.int64), *(1 + k * PIECE + own for k, own in enumerate(rows))])
+    return np.concatenate([np.empty(0, np.int64), *(1 + k * PIECE + in_piece for k, in_piece in enumerate(rows))])
 
 
 def every(values: NDArray[Any], step: int) -> NDArray[Any]:

@@ -48,8 +48,8 @@ class Part:
 
     def rows(self, begin: int, end: int) -> dict[str, Array]:
         """Some rows, stamped as in the log."""
-        own = {name: np.asarray(values[begin:end]) for name, values in self.columns.items()}
-        return own | {"time": np.round(self.stamps(own["time"]), STAMP_DIGITS)}
+        columns = {name: np.asarray(values[begin:end]) for name, values in self.columns.items()}
+        return columns | {"time": np.round(self.stamps(columns["time"]), STAMP_DIGITS)}
 
     def at(self, row: int) -> float:
         """Time of a row in the log [s]."""
@@ -93,8 +93,8 @@ def in_order(parts: Sequence[Mapping[str, Array]]) -> list[Rows]:
     place[order] = np.arange(len(order))
     ends = np.cumsum([len(time) for time in times])[:-1]
     return [
-        _increasing(Rows(own, {**part, "time": time}))
-        for own, part, time in zip(np.split(place, ends), parts, times, strict=True)
+        _increasing(Rows(of_part, {**part, "time": time}))
+        for of_part, part, time in zip(np.split(place, ends), parts, times, strict=True)
     ]
 
 
@@ -119,14 +119,14 @@ def _natural(name: str) -> tuple[str, int]:
 
 def frame_of(rows: Sequence[Rows]) -> pd.DataFrame:
     """The log as a data frame, its empty cells NaN."""
-    names, count = column_names(rows), sum(len(own.place) for own in rows)
+    names, count = column_names(rows), sum(len(part.place) for part in rows)
     if len(rows) == 1:  # nothing to put together: the columns as they are, not copied
         columns = {name: rows[0].columns[name] for name in names}
     else:
         columns = {name: np.full(count, np.nan) for name in names}
-        for own in rows:
-            for name, values in own.columns.items():
-                columns[name][own.place] = values
+        for part in rows:
+            for name, values in part.columns.items():
+                columns[name][part.place] = values
     frame = pd.DataFrame(columns, copy=False)
     if LABEL in frame:
         frame[LABEL] = frame[LABEL].astype("Int64")
@@ -136,15 +136,15 @@ def frame_of(rows: Sequence[Rows]) -> pd.DataFrame:
 def tables_of(rows: Sequence[Rows], source: str) -> Iterator[Table]:
     """One table for each set of rows that feed the same streams; lines are those of the whole log."""
     sets: list[tuple[set[str], list[Rows]]] = []
-    for own in rows:
-        fed, together = _fed(own), [own]
+    for part in rows:
+        fed, together = _fed(part), [part]
         for others in [each for each in sets if each[0] & fed]:
             sets.remove(others)
             fed, together = fed | others[0], others[1] + together
         sets.append((fed, together))
     for _, together in sets:
-        lines = np.sort(np.concatenate([own.place for own in together]))
-        inside = [Rows(np.searchsorted(lines, own.place), own.columns) for own in together]
+        lines = np.sort(np.concatenate([part.place for part in together]))
+        inside = [Rows(np.searchsorted(lines, part.place), part.columns) for part in together]
         yield Table(source, frame_of(inside), lines + 2)
 
 

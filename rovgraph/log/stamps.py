@@ -63,7 +63,7 @@ def counter_range(before: float, after: float) -> float:
 
     One step back does not prove a short counter: a late message causes it, too.
     """
-    for wrap in (own for own in COUNTERS if own > GAP_S):
+    for wrap in (seconds for seconds in COUNTERS if seconds > GAP_S):
         if wrap - _near(wrap) < before <= wrap and 0.0 <= after < _near(wrap):
             return wrap
     return 0.0
@@ -170,20 +170,20 @@ def few_digits(values: Array) -> bool:
 
 
 def known_offset(
-    own: tuple[float, float], other: tuple[float, float], cycle: float = 0.0
+    span: tuple[float, float], other: tuple[float, float], cycle: float = 0.0
 ) -> tuple[float, str, bool] | None:
     """Offset, of the usual ones, that brings a clock's stamps to another's in Unix time.
 
     Parameters
     ----------
-    own, other : first and last stamp of each [s]
-    cycle : the own stamps are Unix time but for multiples of this, such as times of day; 0 = they should be Unix time
+    span, other : first and last stamp of each [s]
+    cycle : those of ``span`` are Unix time but for multiples of this, such as times of day; 0 = all should be Unix time
 
     Returns
     -------
-    what to add to the own stamps [s], why, and whether nothing else meets the other's stamps as well; None = nothing
+    what to add to those of ``span`` [s], why, and whether nothing else meets the other's stamps as well; None = nothing
     """
-    middle = 0.5 * (sum(other) - sum(own))
+    middle = 0.5 * (sum(other) - sum(span))
     nearest = cycle * round(middle / cycle) if cycle else 0.0
     whole = "whole days" if cycle == DAY_S else "whole weeks"
     dated = [(nearest + cycle * k, f"its stamps have no date: {whole} are added") for k in (0, -1, 1)] if cycle else []
@@ -191,7 +191,7 @@ def known_offset(
              for n in (1, -1, 2, -2)]  # fmt: skip
     zones = [(nearest + by, f"its stamps are {_zone(-by)} from UTC, a time zone") for by in ZONES_S]
     for candidates in (dated or weeks, zones):
-        met = sorted(((_met(own, other, by), by, why) for by, why in candidates), key=lambda each: -each[0])
+        met = sorted(((_met(span, other, by), by, why) for by, why in candidates), key=lambda each: -each[0])
         if met[0][0] > 0.0:
             return met[0][1], met[0][2], met[0][0] > SURELY and met[1][0] < 0.5 * met[0][0]
     return None
@@ -201,10 +201,10 @@ def _zone(seconds: float) -> str:
     return f"{seconds / HOUR_S:+.4g} h"
 
 
-def _met(own: tuple[float, float], other: tuple[float, float], by: float) -> float:
-    """The share of the shorter span that lies within the other, if the own one is moved by so much [s]."""
-    shared = min(own[1] + by, other[1]) - max(own[0] + by, other[0])
-    return shared / max(min(own[1] - own[0], other[1] - other[0]), 1e-9)
+def _met(span: tuple[float, float], other: tuple[float, float], by: float) -> float:
+    """The share of the shorter span that lies within the other, if ``span`` is moved by so much [s]."""
+    shared = min(span[1] + by, other[1]) - max(span[0] + by, other[0])
+    return shared / max(min(span[1] - span[0], other[1] - other[0]), 1e-9)
 
 
 def _looks(count: int) -> tuple[int, ...]:
