@@ -255,10 +255,10 @@ class Assembly:
         dive, n = self._dive, len(self)
         pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._listed[:0]
         first = int(dive.keyframes[begin - 1, at.UPTO]) if begin else 0
-        own = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
-        late = int(np.count_nonzero(self._sensors[own, at.LAG] >= 0)) if len(self._sensors) else 0
+        sensors = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
+        late = int(np.count_nonzero(self._sensors[sensors, at.LAG] >= 0)) if len(self._sensors) else 0
         rows, windows = int(dive.counts[at.ROWS]), int(dive.counts[at.WINDOWS])
-        more, scaled = rows + len(own) + len(pieces), int(self._rule.scaled)
+        more, scaled = rows + len(sensors) + len(pieces), int(self._rule.scaled)
         if n > len(dive.motions) or more > len(dive.rows) or windows + late >= len(dive.windows):
             self._dive = dive._replace(
                 motions=_grown(dive.motions, begin, n),
@@ -340,8 +340,8 @@ class Assembly:
         self._dive.keyframes[:, at.UPTO] -= upto
         self._dive.keyframes[:, at.TAKEN] -= rows
         self._dive.of[[at.KEYFRAME_OF, at.INTERVAL_OF]] -= n
-        own = self._dive.of[at.WINDOW_OF]
-        own[own >= 0] -= windows
+        window_of = self._dive.of[at.WINDOW_OF]
+        window_of[window_of >= 0] -= windows
         self.forgotten += n
 
     def __len__(self) -> int:
@@ -516,8 +516,8 @@ class Assembly:
             places: dict[str, list[int]] = {}
             for k, m in enumerate(new):
                 places.setdefault(m.sensor, []).append(k)
-            for sensor, own in places.items():
-                self._listed[begin + np.array(own)] = self._judged(sensor, [new[k] for k in own])
+            for sensor, of_sensor in places.items():
+                self._listed[begin + np.array(of_sensor)] = self._judged(sensor, [new[k] for k in of_sensor])
         return self._listed[: self._come]
 
     @property
@@ -609,7 +609,7 @@ class Assembly:
 
     def _rows_of(self, sensor: str, time: Array, values: Array, line: NDArray[np.int64]) -> Array:
         """Events of n measurements of a sensor, shape (n, VALUES + 2 D)."""
-        instrument, own, D = self.instruments[sensor], SENSORS[sensor], self._most
+        instrument, registered, D = self.instruments[sensor], SENSORS[sensor], self._most
         out, dim = np.zeros((len(time), at.VALUES + 2 * D)), instrument.model.dim
         out[:, at.STAMP], out[:, at.SENSOR], out[:, at.LINE] = time, self._which[sensor], line
         if sensor == PLACE:
@@ -617,8 +617,8 @@ class Assembly:
         else:
             out[:, at.VALUES : at.VALUES + dim] = values[:, :dim]
         sd = instrument.sd
-        if own.standard_deviation is not of_instrument and len(values):
-            sd = np.array([own.standard_deviation(one, instrument, self.config) for one in values])
+        if registered.standard_deviation is not of_instrument and len(values):
+            sd = np.array([registered.standard_deviation(one, instrument, self.config) for one in values])
         out[:, at.VALUES + D : at.VALUES + D + dim] = sd
         return out
 
@@ -668,8 +668,8 @@ class Assembly:
 
     def _count_closing(self, begin: int) -> int:
         """Events from one on that may make a keyframe."""
-        own = self._events[begin:, at.SENSOR].astype(np.int64)
-        return int(np.count_nonzero(self._sensors[own, at.CLOSES])) if len(own) else 0
+        sensors = self._events[begin:, at.SENSOR].astype(np.int64)
+        return int(np.count_nonzero(self._sensors[sensors, at.CLOSES])) if len(sensors) else 0
 
     def _wanted(self, streams: Sequence[Stream]) -> Array:
         """Events of streams in the order of their stamps, without those of which one an interval is taken, where
@@ -690,16 +690,16 @@ class Assembly:
             whole |= (edges[:-1] < time[0]) | (edges[1:] > time[-1] - at.SHORTEST_S)  # what is left out is counted
             for k, stream in enumerate(streams):
                 if SENSORS[stream.sensor].once_per_interval:
-                    own = np.flatnonzero(which == k)
-                    before, after = ends.searchsorted(placed[own]), ends.searchsorted(placed[own], side="right")
+                    rows = np.flatnonzero(which == k)
+                    before, after = ends.searchsorted(placed[rows]), ends.searchsorted(placed[rows], side="right")
                     first = (np.diff(before, prepend=-1) > 0) | (np.diff(after, prepend=-1) > 0)
-                    wanted[own] = whole[after] | whole[before] | first
+                    wanted[rows] = whole[after] | whole[before] | first
         which, index = which[wanted], index[wanted]
         events = np.empty((len(which), at.VALUES + 2 * self._most))
         for k, stream in enumerate(streams):
-            own = which == k
-            some = index[own]
-            events[own] = self._rows_of(stream.sensor, stream.time[some], stream.data[some], stream.row[some])
+            rows = which == k
+            some = index[rows]
+            events[rows] = self._rows_of(stream.sensor, stream.time[some], stream.data[some], stream.row[some])
         return events
 
     def _pieces(self, begin: int) -> Array:
@@ -719,9 +719,9 @@ class Assembly:
                 if isinstance(piece, str):
                     self._no_pieces.append((k, piece))
                 else:
-                    own = self._rows_of("thruster", np.array([piece.time]), piece.values[None], np.array([piece.row]))
-                    own[0, [at.PLACED, at.NAME]] = piece.time, k
-                    out.append(own)
+                    event = self._rows_of("thruster", np.array([piece.time]), piece.values[None], np.array([piece.row]))
+                    event[0, [at.PLACED, at.NAME]] = piece.time, k
+                    out.append(event)
         return np.vstack(out)
 
     def _check_gaps(self, periods: Array, imu: Stream) -> None:

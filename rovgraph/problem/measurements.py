@@ -293,8 +293,8 @@ class Measurements:
         parts = {v: slice(end - sizes[v], end) for v, end in zip(sizes, ends, strict=True)}
         column = np.full(MOTION + calibration_size(), -1)
         for v, part in parts.items():
-            own = _COLUMNS[v] if v in _COLUMNS else slice(MOTION + LAYOUT[v].start, MOTION + LAYOUT[v].stop)
-            column[own] = np.arange(part.start, part.stop)
+            columns = _COLUMNS[v] if v in _COLUMNS else slice(MOTION + LAYOUT[v].start, MOTION + LAYOUT[v].stop)
+            column[columns] = np.arange(part.start, part.stop)
         width = ends[-1] if ends else 0
         r, H = np.zeros(n * dim), np.zeros((n * dim if width else 0, width))
         states = kernel_states(state)

@@ -111,8 +111,8 @@ class Problem:
 
     def steps(self, k: int) -> Array:
         """What the motion to keyframe k was integrated from, shape (s, 8), of `rovgraph.kernels.preintegration`."""
-        own = slice(int(self.taken[k - 1]), int(self.taken[k]))
-        stops = self.rows[own, measured.TIME][self.keyframe[own] < k]
+        of_interval = slice(int(self.taken[k - 1]), int(self.taken[k]))
+        stops = self.rows[of_interval, measured.TIME][self.keyframe[of_interval] < k]
         first, last = (self.keyframes[k, [at.FIRST, at.LAST]].astype(int) - self.forgotten).tolist()
         return integrated_steps(
             self.imu[first:last], self.time[k - 1], stops, self.time[k], np.ascontiguousarray(self.bias)
