@@ -105,8 +105,8 @@ class ChainLayout:
         else:
             place = (keyframe is None, component)
             parts = self.places.items()
-            own = (n for n, (border, p) in parts if border == place[0] and p.start <= place[1] < p.stop)
-            what = next(own, "some variable")
+            names = (n for n, (border, p) in parts if border == place[0] and p.start <= place[1] < p.stop)
+            what = next(names, "some variable")
         return (
             f"the data do not determine {what}: check the log (rovgraph check), "
             "tighten its prior sd, or hold it fixed in the configuration"
@@ -171,8 +171,8 @@ class Chain:
         seconds = np.diff(self.problem.time)
         kept, sd = np.empty((2, len(seconds), self.layout.d - MOTION))
         for name in self.layout.walking:
-            own = self.unknowns.walked(name, seconds[:, None])
-            kept[:, self._walking(name)], sd[:, self._walking(name)] = own
+            of_walk = self.unknowns.walked(name, seconds[:, None])
+            kept[:, self._walking(name)], sd[:, self._walking(name)] = of_walk
             ends = self.problem.time.searchsorted(self.beliefs[name].changes)  # of the intervals that hold changes
             sd[ends[(ends > 0) & (ends < len(self.problem.time))] - 1, self._walking(name)] = self.beliefs[name].sd
         return 1.0 / sd, kept
@@ -334,11 +334,11 @@ class Chain:
             point.v_n[0] - prior.state.v_n[0],
             point.bias[0] - prior.state.bias[0],
         ]
-        own = [
+        of_calibration = [
             (np.atleast_2d(point.calibration[name])[0] - self.beliefs[name].mean) / self.beliefs[name].first_sd
             for name in self.unknowns.estimated
         ]
-        return self._prior_weight @ np.concatenate(parts), np.concatenate([np.empty(0), *own])
+        return self._prior_weight @ np.concatenate(parts), np.concatenate([np.empty(0), *of_calibration])
 
     def _lacking(self, point: State) -> float:
         """Log likelihood that noise has taken from the border's constants, by `Belief.score`."""
@@ -418,9 +418,9 @@ class Chain:
         sd = [np.full(TABLE[n].dim, self.beliefs[n].first_sd) for n in self.layout.walking]
         off = [self.beliefs[n].mean - point.calibration[n][0] for n in self.layout.walking]
         weight = 1.0 / np.concatenate([np.empty(0), *sd])
-        own = np.concatenate([NOTHING, *(self.layout.target(n) for n in self.layout.walking)])
+        targets = np.concatenate([NOTHING, *(self.layout.target(n) for n in self.layout.walking)])
         values = np.concatenate([np.empty(0), *off]) * weight
-        rows.put(1, values[None], np.zeros((1, len(own), MOTION)), np.diag(weight)[None], own, _ONE)
+        rows.put(1, values[None], np.zeros((1, len(targets), MOTION)), np.diag(weight)[None], targets, _ONE)
         tie = np.zeros((1, clones, MOTION))
         tie[0, :, :clones] = STIFF * np.eye(clones)
         clone = self.layout.d + self.layout.c + np.arange(clones)

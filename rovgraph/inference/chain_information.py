@@ -133,11 +133,11 @@ class SquareRoot:
         """
         out, R, z = y.copy(), self.border[:, :-1], self.border[:, -1]
         out[free] = 0.0
-        Q, own = np.linalg.qr(R[:, free])
+        Q, R_free = np.linalg.qr(R[:, free])
         rest = Q.T @ ((0.0 if unforced else z) - R @ out)
         if score is not None:
-            rest += np.linalg.solve(own.T, score[free])
-        out[free] = _solve_upper(own, rest)
+            rest += np.linalg.solve(R_free.T, score[free])
+        out[free] = _solve_upper(R_free, rest)
         return out
 
     def move_to(self, y: Array) -> None:
@@ -224,9 +224,9 @@ class SquareRoot:
             return root @ transpose(root)
         free, out = np.setdiff1d(np.arange(R.shape[1]), held), np.zeros_like(R)
         R = np.asarray(np.linalg.qr(R[:, :, [*free, *held]], mode="r"), dtype=float)
-        own = slice(0, len(free))
-        root = np.asarray(np.linalg.inv(R[:, own, own]), dtype=float)
-        gain = np.asarray(-root @ R[:, own, len(free) :], dtype=float)
+        of_free = slice(0, len(free))
+        root = np.asarray(np.linalg.inv(R[:, of_free, of_free]), dtype=float)
+        gain = np.asarray(-root @ R[:, of_free, len(free) :], dtype=float)
         out[:, free[:, None], free] = root @ transpose(root) + gain @ believed @ transpose(gain)
         out[:, np.array(held)[:, None], held] = believed
         return out
@@ -350,7 +350,9 @@ def eliminate(
     kept_at = np.array(stops, dtype=np.int64)
 
     def fill(conditionals: Array, border: Array, filtered: Array, left: Array) -> int:
-        own, walks = LinearMotions(m.A, m.C, m.targets), Walks(m.walk, m.kept, m.walk_r)
-        return eliminate_rows(own, walks, rows, border_rows, Elimination(kept_at, conditionals, border, filtered, left))
+        linear, walks = LinearMotions(m.A, m.C, m.targets), Walks(m.walk, m.kept, m.walk_r)
+        return eliminate_rows(
+            linear, walks, rows, border_rows, Elimination(kept_at, conditionals, border, filtered, left)
+        )
 
     return square_root(n, m.A.shape[1] + m.walk.shape[1], c, len(stops), fill)

@@ -454,13 +454,13 @@ def _fit(now: _Baseline, candidate: GaussMarkovError) -> tuple[GaussMarkovError,
         return replace(error, gain=-np.inf), fitted
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
     unknowns = now.chain.unknowns
-    own = [n for n in unknowns.considered if not TABLE[n].time_offset]
-    if ARM in own and _noise_moves_arm(now):
-        own.remove(ARM)
+    considered = [n for n in unknowns.considered if not TABLE[n].time_offset]
+    if ARM in considered and _noise_moves_arm(now):
+        considered.remove(ARM)
     known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
     rivals = [error.variable, *known]
-    constants = LinearConstants.of(now.chain, now.solution, [*own, *rivals])
-    constant, held = _as_constant(now, error, own, constants)
+    constants = LinearConstants.of(now.chain, now.solution, [*considered, *rivals])
+    constant, held = _as_constant(now, error, considered, constants)
     if constant.gain >= max(gain, CLEAR):
         of_sensor = error.sensor in TABLE[constant.variable].sensors
         return (constant, held) if of_sensor else (replace(error, gain=-np.inf), fitted)

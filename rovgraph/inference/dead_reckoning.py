@@ -62,8 +62,8 @@ class _Epochs:
 
     def of(self, sensor: str | None) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Epochs and measurements of a sensor."""
-        own = np.isin(self.measured, self.problem.of_sensor(sensor))
-        return self.epoch[own], self.measured[own]
+        of_sensor = np.isin(self.measured, self.problem.of_sensor(sensor))
+        return self.epoch[of_sensor], self.measured[of_sensor]
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,13 @@ def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
     n = len(problem)
     wanted = np.isin(problem.which, [k for k, sensor in enumerate(problem.sensors) if sensor in sensors])
     found = np.flatnonzero(wanted)
-    own, rows = problem.interval[found], problem.rows[found]
-    here = problem.keyframe[found] == own
+    interval, rows = problem.interval[found], problem.rows[found]
+    here = problem.keyframe[found] == interval
     # in an interval first what lies between the keyframes, then its own, then what is measured there
-    order = np.argsort(np.concatenate([3 * np.arange(n) + 1, 3 * own + 2 * here]), kind="stable")
+    order = np.argsort(np.concatenate([3 * np.arange(n) + 1, 3 * interval + 2 * here]), kind="stable")
     place = np.empty(len(order), np.intp)
     place[order] = np.arange(len(order))
-    keyframe, k, of = place[:n], place[n:], np.concatenate([np.arange(n), own])[order]
+    keyframe, k, of = place[:n], place[n:], np.concatenate([np.arange(n), interval])[order]
     m, dR_of = len(order), rows[:, DR:DV].reshape(-1, 3, 3)
     time, dt, dR, dv, assumed = np.empty(m), np.empty(m), np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 6))
     time[keyframe] = problem.time
@@ -170,8 +170,8 @@ def _pings(epochs: _Epochs, sensor: str, initial: InitialConditions, calibration
     rate_b, rate_sd = rows[:, RATE : RATE + 3], rows[:, RATE_SD]
     velocity_b = epochs.problem.z(pings, 3) @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
     var = epochs.problem.sd(pings, 3) ** 2
-    own = 0.5 * (np.sum(var, axis=1) - np.min(var, axis=1))  # the smallest is that of the vertical
-    return _Pings(k, velocity_b, own + np.dot(arm, arm) * rate_sd**2, arm)
+    horizontal_var = 0.5 * (np.sum(var, axis=1) - np.min(var, axis=1))  # the smallest is that of the vertical
+    return _Pings(k, velocity_b, horizontal_var + np.dot(arm, arm) * rate_sd**2, arm)
 
 
 def _attitudes(
@@ -216,8 +216,8 @@ def _densities(epochs: _Epochs, config: Config) -> Array:
     """
     noise = config.imu.noise
     acc = noise.acc**2 + 2.0 * KEEPS_HEADING_S * config.imu.acc_bias_sd_mps2**2
-    own, bridged = [acc, noise.gyr**2, noise.gyr_walk**2], [BRIDGE_ACC**2, BRIDGE_GYR**2, noise.gyr_walk**2]
-    return np.where(epochs.bridged[:, None], bridged, own)
+    of_imu, bridged = [acc, noise.gyr**2, noise.gyr_walk**2], [BRIDGE_ACC**2, BRIDGE_GYR**2, noise.gyr_walk**2]
+    return np.where(epochs.bridged[:, None], bridged, of_imu)
 
 
 def _earth_rate(config: Config) -> Array:
@@ -273,6 +273,6 @@ def _depths(
     if not len(found):
         return integrated
     arm = initial.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
-    own = np.interp(problem.time, problem.rows[found, TIME], problem.z(found, 1)[:, 0]) - calibration["depth_offset"]
-    own /= 1.0 + calibration["depth_scale"]
-    return np.asarray(own - rotate(R_nb, arm)[:, 2])
+    depth = np.interp(problem.time, problem.rows[found, TIME], problem.z(found, 1)[:, 0]) - calibration["depth_offset"]
+    depth /= 1.0 + calibration["depth_scale"]
+    return np.asarray(depth - rotate(R_nb, arm)[:, 2])

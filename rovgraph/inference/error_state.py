@@ -154,22 +154,22 @@ class FilterHistory:
         if problem.used and PLACE in problem.used:
             place = [part.place if len(part.place) else np.full((len(part.nis), 2), np.nan) for part in self._met]
         for sensor in problem.used:
-            own = problem.of_sensor(sensor)
-            block = self._engine.measurements(problem, own)
-            here = smoothed.at(block.keyframe) if smoothed is not None else states_of(*self._states(own))
+            rows = problem.of_sensor(sensor)
+            block = self._engine.measurements(problem, rows)
+            here = smoothed.at(block.keyframe) if smoothed is not None else states_of(*self._states(rows))
             if sensor == PLACE:
-                here = here.seeing(np.concatenate(place)[own])
-            yield sensor, block, here, weight[own]
+                here = here.seeing(np.concatenate(place)[rows])
+            yield sensor, block, here, weight[rows]
 
     def _states(self, index: NDArray[np.int64]) -> tuple[Array, Array]:
         """x and c of some measurements, in order, as the filter met them; of a long dive all of them are large."""
         found, begin = [], 0
         for part in self._met:
             end = begin + len(part.nis)
-            own = index[slice(*index.searchsorted([begin, end]))] - begin
-            if len(own):
+            in_part = index[slice(*index.searchsorted([begin, end]))] - begin
+            if len(in_part):
                 x, c = part.states()
-                found.append((x[own], c[own]))
+                found.append((x[in_part], c[in_part]))
             begin = end
         x, c = (np.concatenate(column) for column in zip(*found, strict=True))
         return x, c
@@ -179,13 +179,13 @@ class FilterHistory:
         every = np.concatenate([np.empty(0), *(part.nis for part in self._met)])
         weight, nis = np.concatenate([np.empty(0), *(part.weight for part in self._met)]), {}
         for sensor in problem.used:
-            own = problem.of_sensor(sensor)
-            admitted = every[own][weight[own] > 0.0]
+            rows = problem.of_sensor(sensor)
+            admitted = every[rows][weight[rows] > 0.0]
             nis[sensor] = {
                 "mean": float(np.mean(admitted)) if len(admitted) else None,
                 "dim": self._engine.initial.instruments[sensor].model.dim,
                 "count": len(admitted),
-                "rejected": len(own) - len(admitted),
+                "rejected": len(rows) - len(admitted),
             }
         return {"keyframes": len(self), "nis": nis, "bridged_intervals": int(problem.bridged.sum())}
 
@@ -222,13 +222,13 @@ def reinitialised(engine: FilterEngine, problem: Problem, states: State) -> tupl
     joint[:size, :size], joint[size + more :, size + more :] = start.P, start.L @ start.L.T
     known = np.concatenate([known + more * (known >= size), np.arange(size, size + more)])
     joint[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
-    own = slice(0, size + more)
+    estimated = slice(0, size + more)
     L = np.asarray(np.linalg.cholesky(joint[size + more :, size + more :]), dtype=float)
-    B = np.asarray(np.linalg.solve(L, joint[size + more :, own]).T, dtype=float)
+    B = np.asarray(np.linalg.solve(L, joint[size + more :, estimated]).T, dtype=float)
     state = best.state.at([len(problem) - 1])
     calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
     newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
-    return replace(Gaussian.of(newest, joint[own, own] - B @ B.T, places), B=B, L=L), best
+    return replace(Gaussian.of(newest, joint[estimated, estimated] - B @ B.T, places), B=B, L=L), best
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:

@@ -209,8 +209,8 @@ def _without_stretch_in(
     """The same, sought in a part of the dive; what is found there is solved in all of it."""
     measured = part.problem.measured()
     before = tuple(s for s in best.stretches if s.sensor in measured and _barred(measured, [s])[s.sensor].any())
-    own = replace(best, point=part.point(best.point), gates=part.gates(best.gates), stretches=before)
-    found = _without_stretch(part.problem, resume(part.problem, own.point, own, TOLERANCE), burst)
+    in_part = replace(best, point=part.point(best.point), gates=part.gates(best.gates), stretches=before)
+    found = _without_stretch(part.problem, resume(part.problem, in_part.point, in_part, TOLERANCE), burst)
     if found is None or found.stretches == before:
         return found and replace(best, runner_up=found.runner_up)
     known = replace(

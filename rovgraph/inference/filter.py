@@ -202,8 +202,8 @@ class ErrorLayout:
         self.column[:MOTION] = np.arange(MOTION)
         for name, part in LAYOUT.items():
             if name in self.columns:
-                own = self.columns[name]
-                self.column[MOTION + part.start : MOTION + part.stop] = np.arange(own.start, own.stop)
+                target = self.columns[name]
+                self.column[MOTION + part.start : MOTION + part.stop] = np.arange(target.start, target.stop)
 
         self.coordinates = self._coordinates(instruments)
 
@@ -211,8 +211,8 @@ class ErrorLayout:
         """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
         estimated = np.flatnonzero((self.column >= 0) & (self.column < self.size))
         columns = estimated[np.argsort(self.column[estimated])]
-        own = {name for name, part in self.columns.items() if part.stop <= self.size}
-        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in own}
+        names = {name for name, part in self.columns.items() if part.stop <= self.size}
+        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in names}
         models = [(model, self.columns[variable]) for variable, model in shown.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
         params = np.zeros((len(models), max((model.packed.shape[1] for model, _ in models), default=0)))
@@ -337,8 +337,8 @@ class FilterEngine:
         """`step` by one call of a kernel."""
         between, departed = here - met.begin, _room(before) if wholly else _NO_STATE
         predicted = _room(before) if wholly else _NO_STATE._replace(x=np.empty(21), c=np.empty(len(before.c)))
-        own = self._interval(problem, slice(met.begin, met.end), k, between)
-        known, out = self._take_interval(before, own, gates, departed, predicted)
+        interval = self._interval(problem, slice(met.begin, met.end), k, between)
+        known, out = self._take_interval(before, interval, gates, departed, predicted)
         for some, of in ((slice(0, between), before), (slice(between, None), predicted)):
             met.x[some], met.c[some] = of.x, of.c
         met.nis[:], met.weight[:] = out.nis, out.weight
@@ -386,15 +386,15 @@ class FilterEngine:
         """
         assert len(problem.covariances) == len(problem.motions)  # kernels do not check where they read
         known, since = _state(before), self._since(gates)
-        own = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
-        taken, first = problem.taken[begin:end] - own.start, problem.first[begin:end] - own.start
-        k, m, C, size = end - begin, own.stop - own.start, len(before.c), self.layout.size
+        rows = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
+        taken, first = problem.taken[begin:end] - rows.start, problem.first[begin:end] - rows.start
+        k, m, C, size = end - begin, rows.stop - rows.start, len(before.c), self.layout.size
         shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
         some = slice(begin - 1, end - 1)
         motions, covariances, scales = problem.motions[some], problem.covariances[some], problem.scales[some]
         intervals = Intervals(motions, covariances, scales, np.append(0, taken), first, POORLY_KNOWN)
-        measured = problem.measured(own)
+        measured = problem.measured(rows)
         done = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
         m = int(taken[done - 1]) if done else 0
@@ -441,10 +441,10 @@ class FilterEngine:
         if not len(known.L):
             return np.zeros(problem.dims[problem.which[row]])
         _, H = self.linearize(known, problem, np.array([row]))
-        own, considered = H[:, : self.layout.size], H[:, self.layout.size : self.layout.width]
+        estimated, considered = H[:, : self.layout.size], H[:, self.layout.size : self.layout.width]
         B, P = known.B[: self.layout.size], known.P[: self.layout.size, : self.layout.size]
-        by_considered = own @ B + considered @ known.L
-        return np.asarray(np.sum(by_considered**2, axis=1) / (np.sum(own @ P * own, axis=1) + 1.0))
+        by_considered = estimated @ B + considered @ known.L
+        return np.asarray(np.sum(by_considered**2, axis=1) / (np.sum(estimated @ P * estimated, axis=1) + 1.0))
 
     def knows(self, sensor: str) -> bool:
         """Whether the kernels have a sensor's equation."""
@@ -499,17 +499,17 @@ class FilterEngine:
             return known
         P = known.P.copy()
         for name in names:
-            own = np.arange(len(P))[self.layout.columns[name]]
-            P[own, own] += self.beliefs[name].sd ** 2
+            index = np.arange(len(P))[self.layout.columns[name]]
+            P[index, index] += self.beliefs[name].sd ** 2
         return replace(known, P=P)
 
     def _align(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
         """The keyframe before keyframe k; where its attitude is poorly known, with the one it is corrected to."""
         if not poorly_known(known):
             return known
-        own = slice(problem.measured_in(k)[0], self._first_here(problem, k))
-        near = aligned(known, problem, k, own, self.linearize, self._gravity)
-        after = self.correct(near, problem, own, None)
+        rows = slice(problem.measured_in(k)[0], self._first_here(problem, k))
+        near = aligned(known, problem, k, rows, self.linearize, self._gravity)
+        after = self.correct(near, problem, rows, None)
         return with_attitude(known, after.state.R_nb[0])
 
     def _correct(
@@ -518,10 +518,12 @@ class FilterEngine:
         """The estimate corrected by measurements of no places."""
         which = problem.which[index]
         given = [self._of_model(before, problem, row) for row in index[self._outside[which]].tolist()]
-        own = self._interval(problem, index)
+        interval = self._interval(problem, index)
         if given:
-            own = own._replace(given_r=np.concatenate([r for r, _ in given]), given_H=np.vstack([H for _, H in given]))
-        known, out = self._take_interval(before, own, gates)
+            interval = interval._replace(
+                given_r=np.concatenate([r for r, _ in given]), given_H=np.vstack([H for _, H in given])
+            )
+        known, out = self._take_interval(before, interval, gates)
         if met is not None:
             met.put(index, before, out.nis, out.weight)
         return _estimate(known, moved(before.places, out.places) if len(out.places) else before.places)
@@ -568,7 +570,7 @@ class FilterEngine:
     def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by given whitened rows of a place, and the weight of the measurement."""
         which, window = np.array([self._index[PLACE]]), np.full(1, -1)
-        own = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
-        interval = Interval(_NO_MOTION, _NO_COVARIANCE, _EXACT[:, 0], own, 0, r, H)
+        rows = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
+        interval = Interval(_NO_MOTION, _NO_COVARIANCE, _EXACT[:, 0], rows, 0, r, H)
         known, out = self._take_interval(before, interval, None)
         return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

@@ -158,14 +158,14 @@ class Met:
 
     def put(self, index: NDArray[np.int64], before: Gaussian, nis: Array, weight: Array) -> None:
         """Some of them, met by an estimate."""
-        own = index - self.begin
-        self.x[own], self.c[own], self.nis[own], self.weight[own] = before.x, before.c, nis, weight
+        slots = index - self.begin
+        self.x[slots], self.c[slots], self.nis[slots], self.weight[slots] = before.x, before.c, nis, weight
 
     def see(self, row: int, before: Gaussian, nis: float, weight: float, place: Array, number: int) -> None:
         """One of a place."""
-        own = row - self.begin
-        self.x[own], self.c[own], self.nis[own], self.weight[own] = before.x, before.c, nis, weight
-        self.place[own], self.number[own] = place, number
+        slot = row - self.begin
+        self.x[slot], self.c[slot], self.nis[slot], self.weight[slot] = before.x, before.c, nis, weight
+        self.place[slot], self.number[slot] = place, number
 
 
 @dataclass(frozen=True)

@@ -241,8 +241,8 @@ class FixedLag:
         for k in range(n - made, n):
             done = self.filter.step(problem, k, known, self._gates)
             known, index = done.filtered, self.assembly.forgotten + k
-            own = problem.keyframes[k].copy(), bool(k and problem.motions[k - 1, GAP] > 0.0), closed(k)
-            self.snapshots.append(FilterSnapshot(index, *own, known, dict(self._gates), done.met))
+            of_keyframe = problem.keyframes[k].copy(), bool(k and problem.motions[k - 1, GAP] > 0.0), closed(k)
+            self.snapshots.append(FilterSnapshot(index, *of_keyframe, known, dict(self._gates), done.met))
         self.assembly.time_offsets.assume(known.c)
         while self.snapshots[0].time < self.snapshots[-1].time - self.lag_s:
             self.passed(self.snapshots.popleft())

@@ -298,8 +298,8 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
 
 def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
     """The first fix, shape (2,), and its sd [m]; the line through the first ones instead of one that is far off it."""
-    own = fixes["fix_sd"][0]
-    sd = float(own) if own > 0.0 else sd
+    logged_sd = fixes["fix_sd"][0]
+    sd = float(logged_sd) if logged_sd > 0.0 else sd
     line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
     off = float(np.linalg.norm(fixes.data[0, :2] - line))
     return (line if off > AGREE_SD * (sd + FIRST_FIX_SD) else fixes.data[0, :2]), sd
@@ -463,8 +463,8 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)
     elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
-    own = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
-    used = own + heading_sources(config, present) + _thrusters(log, config, expected)
+    without_heading = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
+    used = without_heading + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
     resting = unchecked(config, sources, log.sensors, expected)
@@ -585,7 +585,9 @@ def _attitude(
     stated = start.roll_deg, start.pitch_deg
     moving = not first.quiet and not has_constant_velocity(config)
     from_log = first_tilt(log) if has_constant_velocity(config) else level_from_force(first.force_b).tolist()
-    roll, pitch = (own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, from_log, strict=True))
+    roll, pitch = (
+        tilt if said is None else float(np.deg2rad(said)) for said, tilt in zip(stated, from_log, strict=True)
+    )
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
     if moving and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)

@@ -81,9 +81,9 @@ def _by_rate_noise(best: Optimum, keyframes: Sequence[int], sd: Array) -> Array:
     """Spurious information of the DVL's arm, which grows with the dive, shape (m, c, c)."""
     out = np.zeros((*sd.shape, sd.shape[1]))
     if best.unknowns.walks.get(ARM) == 0.0:
-        own = np.r_[estimated_parts(best)[ARM]]
+        arm = np.r_[estimated_parts(best)[ARM]]
         until = (np.array(keyframes) + 1.0) / len(best.problem)
-        out[:, own, own] = until[:, None] * spurious_information(best).information * sd[:, own] ** 2
+        out[:, arm, arm] = until[:, None] * spurious_information(best).information * sd[:, arm] ** 2
     return out
 
 
@@ -157,8 +157,8 @@ def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
     dict : name -> ndarray, shape (dim,), of what was estimated
     """
     before = joint_prior_sd(best, len(best.problem) - 1)
-    own = slice(NEWEST, NEWEST + sum(map(len, before.values())))
-    covariance = best.newest_covariance()[own, own]
+    of_calibration = slice(NEWEST, NEWEST + sum(map(len, before.values())))
+    covariance = best.newest_covariance()[of_calibration, of_calibration]
     relative = relative_sd(best, covariance, before)
     claimed = {name: sd / before[name] for name, sd in _sds(covariance, before).items()}
     held = spuriously_observable(best.unknowns, claimed, relative)

@@ -69,8 +69,8 @@ def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = N
     used, beliefs = {*best.chain.blocks, "imu"}, dict(best.beliefs)
     held = [n for n in names if n not in best.unknowns.estimated and used & set(beliefs[n].variable.sensors)]
     for name in held:
-        own = beliefs[name]
-        beliefs[name] = replace(own, estimate=True, sd=WIDE * own.variable.sd, walk=0.0)
+        belief = beliefs[name]
+        beliefs[name] = replace(belief, estimate=True, sd=WIDE * belief.variable.sd, walk=0.0)
     released = widened(best.chain, best.state, tuple(held), beliefs)
     root = released.eliminate(best.state, best.solution.gates if gates is None else gates, kept=1)
     R, z = root.border[:, :-1], root.border[:, -1]

@@ -265,9 +265,9 @@ def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
         return None
     prior = joint_prior_sd(best, len(best.problem) - 1)
     sd = np.concatenate([prior[name] for name in names])
-    own = slice(NEWEST, NEWEST + len(sd))
+    of_calibration = slice(NEWEST, NEWEST + len(sd))
     return {
         "labels": [label for name in names for label in best.beliefs[name].variable.labels],
         "prior_sd": sd.tolist(),
-        "covariance": best.newest_covariance()[own, own].tolist(),
+        "covariance": best.newest_covariance()[of_calibration, of_calibration].tolist(),
     }

@@ -124,21 +124,23 @@ def _of_measurements(chain: Chain, best: ChainOptimum, step: ChainStep) -> list[
     for sensor, block in best.chain.blocks.items():
         moved, gate = np.empty(block.z.shape), best.solution.gates[sensor]
         for part in pieces(0, len(block)):
-            own = block.at(part)
-            moved[part] = _along(chain, own, own.weighted(best.linearised_at.at(own.keyframe), gate[part])[1], step)
+            piece = block.at(part)
+            moved[part] = _along(
+                chain, piece, piece.weighted(best.linearised_at.at(piece.keyframe), gate[part])[1], step
+            )
         out.append((sensor, _squares(moved)))
     return out
 
 
 def _along(chain: Chain, block: Measurements, H: dict[str, Array], step: ChainStep) -> Array:
     """Derivative of whitened measurements along a step, shape (n, dim)."""
-    own, total = step.x[block.keyframe], np.zeros(block.z.shape)
+    dx, total = step.x[block.keyframe], np.zeros(block.z.shape)
     for name, by in H.items():
         if name in COLUMNS:
-            move = own[:, :MOTION][:, COLUMNS[name]]
+            move = dx[:, :MOTION][:, COLUMNS[name]]
         elif name in chain.layout.places:
             border, part = chain.layout.places[name]
-            move = np.broadcast_to(step.y[part], (len(own), part.stop - part.start)) if border else own[:, part]
+            move = np.broadcast_to(step.y[part], (len(dx), part.stop - part.start)) if border else dx[:, part]
         else:
             continue
         total += np.einsum("nij,nj->ni", by, move)

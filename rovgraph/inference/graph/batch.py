@@ -193,7 +193,7 @@ def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Ma
     fixed : name -> ndarray, shape (3,), values of the scales that are not estimated
     keys : of those that are
     """
-    own, W, row = _keys(k), problem.weights[k - 1], problem.motions[k - 1 : k]
+    symbols, W, row = _keys(k), problem.weights[k - 1], problem.motions[k - 1 : k]
     S = problem.scales[k - 1] if len(problem.scales) else None
 
     def state(values: gtsam.Values, pose: int, velocity: int, bias: int) -> States:
@@ -206,7 +206,7 @@ def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Ma
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
-        ends = state(values, own[0], own[1], own[4]), state(values, own[2], own[3], own[5])
+        ends = state(values, symbols[0], symbols[1], symbols[4]), state(values, symbols[2], symbols[3], symbols[5])
         motion_errors(row, *ends, r, A_i, A_j)
         if H is not None:
             J = W @ np.hstack([A_i[0], A_j[0]])
@@ -218,7 +218,7 @@ def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Ma
                 H[place] = W[:, :9] @ A_i[0, :9, 9:] @ S[:, COLUMNS[name]]
         return np.asarray(W @ r[0])
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(15), [*own, *keys.values()], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(15), [*symbols, *keys.values()], error)
 
 
 def _keys(k: int) -> list[int]:
@@ -252,8 +252,8 @@ class RowPlaces:
         first = np.empty_like(dims)
         first[order] = np.cumsum(dims[order]) - dims[order]
         self._count = int(dims.sum())
-        own = np.split(first, np.cumsum([len(block) for block in every])[:-1])
-        self._rows = [f[:, None] + np.arange(block.z.shape[1]) for f, block in zip(own, every, strict=True)]
+        first_rows = np.split(first, np.cumsum([len(block) for block in every])[:-1])
+        self._rows = [f[:, None] + np.arange(block.z.shape[1]) for f, block in zip(first_rows, every, strict=True)]
         other = np.diff(keyframe[order], prepend=-1).astype(bool) | np.diff(place[order], prepend=-2).astype(bool)
         begun = order[np.flatnonzero(other)]  # the first measurement of each factor
         index = dict.fromkeys(DIMENSION, keyframe) | {PLACE: place}
@@ -275,10 +275,10 @@ class RowPlaces:
             b[rows] = r
             for v, h in H.items():
                 A[v][rows] = h
-        for keys, own in zip(self._keys, self._of_factor, strict=True):
-            terms = [(k, a[own]) for k, a in zip(keys, A.values(), strict=True)]
+        for keys, of_factor in zip(self._keys, self._of_factor, strict=True):
+            terms = [(k, a[of_factor]) for k, a in zip(keys, A.values(), strict=True)]
             # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
-            graph.push_back(gtsam.GaussianConditional(terms, 1, b[own], _unit(own.stop - own.start)))
+            graph.push_back(gtsam.GaussianConditional(terms, 1, b[of_factor], _unit(of_factor.stop - of_factor.start)))
 
 
 FARTHEST_STEP = 1e7  # beyond it QR has divided by rounding, where Cholesky found nothing to divide by
@@ -441,8 +441,8 @@ def make_values(graph: DiveGraph, states: State, calibration: Mapping[str, Array
     values = gtsam.Values()
     for i in range(graph.count):
         insert_state(values, i, states.at([i]))
-    for own in range(int(graph.index[-1]) + 1) if any(graph.unknowns.walks.values()) else (0,):
-        insert_calibration(values, calibration or graph.unknowns.fixed, graph.unknowns, own)
+    for segment in range(int(graph.index[-1]) + 1) if any(graph.unknowns.walks.values()) else (0,):
+        insert_calibration(values, calibration or graph.unknowns.fixed, graph.unknowns, segment)
     return values
 
 

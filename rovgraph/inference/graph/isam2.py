@@ -190,11 +190,11 @@ class Linearization:
             shift = np.einsum("nij,nj->ni", S, c[first:, _SCALE])
             b_i, b_j = b_i + shift, b_j + shift
         R, p, v = x[first:, :9].reshape(-1, 3, 3).copy(), x[first:, 9:12].copy(), x[first:, 12:15].copy()
-        own = r[first:], A_i[first:], A_j[first:]
-        motion_errors(rows, States(R[:-1], p[:-1], v[:-1], b_i), States(R[1:], p[1:], v[1:], b_j), *own)
-        own[0][:], own[1][:], own[2][:] = rotate(W, own[0]), W @ own[1], W @ own[2]
+        views = r[first:], A_i[first:], A_j[first:]
+        motion_errors(rows, States(R[:-1], p[:-1], v[:-1], b_i), States(R[1:], p[1:], v[1:], b_j), *views)
+        views[0][:], views[1][:], views[2][:] = rotate(W, views[0]), W @ views[1], W @ views[2]
         if S is not None:
-            by_scale = (own[1][:, :, 9:] + own[2][:, :, 9:]) @ S  # of both alike, so that it is no walk of the bias
+            by_scale = (views[1][:, :, 9:] + views[2][:, :, 9:]) @ S  # of both alike, so that it is no walk of the bias
             for name, part in self._scales:
                 C[first:, :, part.start - MOTION : part.stop - MOTION] = by_scale[:, :, COLUMNS[name]]
         r[first:] *= -1.0
@@ -323,9 +323,9 @@ class Incremental:
         root = np.linalg.inv(R)
         P, delta = root @ root.T, root @ d
         c = self._c[s].copy()
-        own = MOTION + len(self._parts)
-        c[self._parts] += delta[MOTION:own]
-        of_places = delta[own:].reshape(-1, PLACE_DIM)
+        end = MOTION + len(self._parts)
+        c[self._parts] += delta[MOTION:end]
+        of_places = delta[end:].reshape(-1, PLACE_DIM)
         positions = [self._places[n] + by for n, by in zip(places, of_places, strict=True)]
         return moved(self._x[k][None], delta[None, :MOTION])[0], c, P, positions
 
@@ -366,7 +366,7 @@ class Incremental:
         self._x[first:] = list(x[first:])
         self._c[segment:] = [c[begun] for begun in self._begun[segment:]]
         if segment > 0:
-            self._removed = [slot for own in self._slots[first:] for slot in own]
+            self._removed = [slot for slots in self._slots[first:] for slot in slots]
         else:
             self._restart()
         self._replace(segment)
@@ -381,10 +381,10 @@ class Incremental:
         x, c : ndarray, shapes (n, 21), (n, C), of their keyframes
         """
         kept = np.empty(len(problem.rows), bool)
-        for sensor, own in let_in.items():
-            kept[problem.of_sensor(sensor)] = own
+        for sensor, admitted in let_in.items():
+            kept[problem.of_sensor(sensor)] = admitted
         every = (np.arange(*problem.measured_in(k)) for k in range(len(problem)))
-        self._terms = [IntervalTerms(self._filter, problem, k, own[kept[own]]) for k, own in enumerate(every)]
+        self._terms = [IntervalTerms(self._filter, problem, k, rows[kept[rows]]) for k, rows in enumerate(every)]
         self._numbers = problem.number
         self._x, self._c, self._places = list(x), [c[begun] for begun in self._begun], {}
         self._restart()
@@ -436,14 +436,16 @@ class Incremental:
 
     def _calibration_factor(self, s: int, time: float) -> gtsam.JacobianFactor:
         """The prior of the first segment's calibration, or the walk to a segment from the one before."""
-        own, here = key(CALIBRATION, s), self._c[s][self._parts]
+        calibration_key, here = key(CALIBRATION, s), self._c[s][self._parts]
         if s == 0:
-            return gtsam.JacobianFactor(own, np.diag(1.0 / self._sd), (self._mean - here) / self._sd, _unit(len(here)))
+            return gtsam.JacobianFactor(
+                calibration_key, np.diag(1.0 / self._sd), (self._mean - here) / self._sd, _unit(len(here))
+            )
         duration = time - self._terms[self._begun[s - 1]].time
         kept, sd = walked(self._walk, self._time_constant, duration)
         off = (self._mean + kept * (self._c[s - 1][self._parts] - self._mean) - here) / sd
         return gtsam.JacobianFactor(
-            key(CALIBRATION, s - 1), -np.diag(kept / sd), own, np.diag(1.0 / sd), off, _unit(len(here))
+            key(CALIBRATION, s - 1), -np.diag(kept / sd), calibration_key, np.diag(1.0 / sd), off, _unit(len(here))
         )
 
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:
@@ -472,10 +474,10 @@ class Incremental:
 
 
 def _interval_factor(index: int, segment: int, rows: LinearInterval) -> gtsam.JacobianFactor:
-    own, unit = (key(POSE, index), rows.A_j, key(CALIBRATION, segment), rows.C), _unit(len(rows.r))
+    terms, unit = (key(POSE, index), rows.A_j, key(CALIBRATION, segment), rows.C), _unit(len(rows.r))
     if index == 0:
-        return gtsam.JacobianFactor(*own, rows.r, unit)
-    return gtsam.JacobianFactor(key(POSE, index - 1), rows.A_i, *own, rows.r, unit)
+        return gtsam.JacobianFactor(*terms, rows.r, unit)
+    return gtsam.JacobianFactor(key(POSE, index - 1), rows.A_i, *terms, rows.r, unit)
 
 
 def moved(x: Array, delta: Array) -> Array:

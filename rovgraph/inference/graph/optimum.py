@@ -47,8 +47,8 @@ def knowledge(graph: DiveGraph, values: gtsam.Values, gates: Gates, keyframes: S
         last += [key(POSE, 0), *_calibration(graph, int(graph.index[end]))]
         open_places = _seen_again(graph, end)
         left, root = eliminate(piece, last + open_places)
-        own = len(root) - PLACE_DIM * len(open_places)
-        joint.append((root @ root.T)[:own, :own])
+        size = len(root) - PLACE_DIM * len(open_places)
+        joint.append((root @ root.T)[:size, :size])
     P = np.array(joint)
     begin = DIMENSION[POSE] + DIMENSION[VELOCITY]
     rows = np.r_[begin : begin + 9, begin + 12 : P.shape[1]]  # without the first position
@@ -113,8 +113,8 @@ def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Seq
         rhs = gtsam.VectorValues()
         for i in range(others):
             rhs.insert(net.at(i).firstFrontalKey(), np.zeros(net.at(i).rows()))
-        for one, own in zip(given, np.split(unit, ends), strict=True):
-            rhs.insert(one, own)
+        for one, component in zip(given, np.split(unit, ends), strict=True):
+            rhs.insert(one, component)
         moved = net.backSubstitute(rhs)
         for one, column in columns.items():
             column.append(moved.at(one))
@@ -156,8 +156,8 @@ def _pieces(
     newest = []
     for k in range(linear.size()):
         keys = linear.at(k).keys()
-        own = [key_index(one) for one in keys if not is_place(one)]
-        newest.append(max((i if state else begun[i] for state, i in own), default=first_seen.get(keys[0], 0)))
+        indices = [key_index(one) for one in keys if not is_place(one)]
+        newest.append(max((i if state else begun[i] for state, i in indices), default=first_seen.get(keys[0], 0)))
     for k, piece in enumerate(np.searchsorted(ends, newest).tolist()):
         if piece < len(pieces):
             pieces[piece].push_back(linear.at(k))
@@ -288,15 +288,15 @@ class GraphOptimum:
         out = {}
         for variable in (POSE, VELOCITY, BIAS, *self.unknowns.estimated):
             keys = self._keys(variable)
-            P = np.array([known[own] for own in keys])
+            P = np.array([known[one] for one in keys])
             if self.unknowns.considered:
-                K = np.array([self._sensitivity[own] for own in keys])
+                K = np.array([self._sensitivity[one] for one in keys])
                 P += K @ transpose(K)
             out[variable] = P
         for variable in self.unknowns.considered:
             belief = self.beliefs[variable]
-            own = np.eye(belief.variable.dim) * belief.sd**2
-            out[variable] = np.broadcast_to(own, (self.graph.count, *own.shape))
+            prior = np.eye(belief.variable.dim) * belief.sd**2
+            out[variable] = np.broadcast_to(prior, (self.graph.count, *prior.shape))
         return out
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
@@ -308,9 +308,9 @@ class GraphOptimum:
         K = np.vstack([self._sensitivity[one] for one in newest_keys(self.graph, places)])
         beliefs = [self.beliefs[name] for name in names]
         sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])
-        own, end = K.shape[1], len(K) - PLACE_DIM * len(places)
-        P, K = np.zeros((len(K) + own, len(K) + own)), np.insert(K, end, np.diag(sd), axis=0)
-        others = np.r_[:end, end + own : len(P)]
+        count, end = K.shape[1], len(K) - PLACE_DIM * len(places)
+        P, K = np.zeros((len(K) + count, len(K) + count)), np.insert(K, end, np.diag(sd), axis=0)
+        others = np.r_[:end, end + count : len(P)]
         P[np.ix_(others, others)] = known
         return np.asarray(P + K @ K.T)
 

@@ -139,16 +139,18 @@ def insert_places(values: gtsam.Values, block: Measurements, states: State) -> N
     """
     where = block.predicted(states.seeing(ORIGIN))
     for k in np.flatnonzero(block.believed).tolist():
-        if not values.exists(own := key(PLACE, int(block.place[k]))):
-            values.insert(own, where[k])
+        if not values.exists(place_key := key(PLACE, int(block.place[k]))):
+            values.insert(place_key, where[k])
 
 
-def matched(names: Array, own: NDArray[np.int64], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
+def matched(
+    names: Array, alone: NDArray[np.int64], where: Array, covariance: Array, gate_sd: float | None
+) -> list[int]:
     """Number of the place that each of m landmarks is of, which are in the order of time.
 
     Parameters
     ----------
-    names, own : shape (m,), of the landmarks, and the numbers of the places that they are of by themselves
+    names, alone : shape (m,), of the landmarks, and the numbers of the places that they are of by themselves
     where : ndarray, shape (m, 2), north and east of each place if its landmark is believed alone [m]
     covariance : ndarray, shape (2 m, 2 m), joint
     gate_sd : beyond which two landmarks are not of one place, or None
@@ -168,7 +170,7 @@ def matched(names: Array, own: NDArray[np.int64], where: Array, covariance: Arra
             if nis <= least:
                 best, least = number, nis
         if best is None:
-            best = int(own[k])
+            best = int(alone[k])
         else:  # the two are one: condition on that
             there = _rows(places[best])
             H = np.zeros((PLACE_DIM, len(mean)))
@@ -194,10 +196,10 @@ def _where(block: Measurements, graph: DiveGraph, solution: GaussNewtonResult[gt
     by_poses = np.zeros((len(block), PLACE_DIM, len(frames), DIMENSION[POSE]))
     by_poses[np.arange(len(block)), :, column] = H[POSE]
     spread = by_poses.reshape(-1, len(root)) @ root
-    own = np.linalg.inv(block.W)
+    noise = np.linalg.inv(block.W)
     covariance = spread @ spread.T
     for k in range(len(block)):
-        covariance[_rows(k), _rows(k)] += own[k] @ own[k].T
+        covariance[_rows(k), _rows(k)] += noise[k] @ noise[k].T
     return where, covariance
 
 
