@@ -109,8 +109,8 @@ class LastingErrors:
     def at(self, time: Array) -> dict[str, Array]:
         """Variable -> ndarray, shape (n, dim), at n epochs [s]."""
         return {
-            name: np.column_stack([np.interp(time, own, values) for values in every.T])
-            for name, (own, every) in self.series.items()
+            name: np.column_stack([np.interp(time, times, values) for values in every.T])
+            for name, (times, every) in self.series.items()
         }
 
 
@@ -127,12 +127,12 @@ def draw_lasting(
     rng : the same seed gives the same errors; its own stream stays as it is
     """
     series: dict[str, tuple[Array, Array]] = {}
-    for own, (name, belief) in zip(rng.spawn(len(beliefs(truth.config))), beliefs(truth.config).items(), strict=True):
+    for child, (name, belief) in zip(rng.spawn(len(beliefs(truth.config))), beliefs(truth.config).items(), strict=True):
         lasts = belief.estimate and np.isfinite(belief.time_constant) and not of_waves(belief)
         if truth.noise and lasts and name not in truth.calibration:
             step = belief.time_constant / STEPS
             time = step * np.arange(int(seconds / step) + 2.0)
-            white = belief.sd * own.standard_normal((len(time), belief.variable.dim))
+            white = belief.sd * child.standard_normal((len(time), belief.variable.dim))
             white[0] = calibration[name] - belief.mean
             series[name] = time, belief.mean + remembered(white, STEPS)
     return LastingErrors(series)

@@ -636,10 +636,10 @@ def _stationary(world: World) -> Made:
     return path, truth
 
 
-def _duration(chosen: float | None, own: float) -> float:
+def _duration(chosen: float | None, planned: float) -> float:
     if chosen is not None and not (1.0 <= chosen <= LONGEST_S):
         raise InputError(f"duration of {chosen:g} s: between 1 and {LONGEST_S:.0f} s are expected")
-    return own if chosen is None else chosen
+    return planned if chosen is None else chosen
 
 
 _LAKE = frozenset({"duration", "speed", "current"})

@@ -65,8 +65,8 @@ def known(dive: Dive, config: Config) -> Config:
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    own = with_priors_stated(config.as_recorded())
-    return own.model_copy(update={"start": start, "columns": {}, "units": {}})
+    recorded = with_priors_stated(config.as_recorded())
+    return recorded.model_copy(update={"start": start, "columns": {}, "units": {}})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

@@ -159,8 +159,8 @@ class Truth:
         out = {}
         entropy = int(rng.integers(2**62))
         for name, belief in beliefs(self.config).items():
-            own = np.random.default_rng([entropy, zlib.crc32(name.encode())])
-            draw = belief.sd * own.standard_normal(belief.variable.dim)
+            generator = np.random.default_rng([entropy, zlib.crc32(name.encode())])
+            draw = belief.sd * generator.standard_normal(belief.variable.dim)
             uncertain = (belief.estimate or belief.considered) and not of_waves(belief)
             value = belief.mean + draw if uncertain and self.noise else belief.mean
             out[name] = np.array(self.calibration.get(name, value), float).reshape(belief.variable.dim)
