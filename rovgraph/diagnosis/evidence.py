@@ -126,9 +126,9 @@ def residuals_by_sensor(frame: pd.DataFrame) -> dict[str, SensorResiduals]:
     out, sensor, component = {}, frame["sensor"].to_numpy(), frame["component"].to_numpy()
     columns = {name: frame[name].to_numpy(float) for name in ("time", "normalised", "weight")}
     for name in pd.unique(frame["sensor"]).tolist():
-        own = np.flatnonzero(sensor == name)
-        labels = tuple(pd.unique(component[own]).tolist())
-        first = [own[component[own] == label] for label in labels]
+        rows = np.flatnonzero(sensor == name)
+        labels = tuple(pd.unique(component[rows]).tolist())
+        first = [rows[component[rows] == label] for label in labels]
         normalised = np.column_stack([columns["normalised"][index] for index in first])
         out[name] = SensorResiduals(name, labels, columns["time"][first[0]], normalised, columns["weight"][first[0]])
     return out

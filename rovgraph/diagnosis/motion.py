@@ -223,9 +223,9 @@ def separation_of(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statis
         "depth": (joint["depth"], np.abs(d[:, 2]), "m"),
         "heading": (joint["heading"], np.rad2deg(np.abs(turned)), "deg"),
     }
-    own = _squares(f.take(at), s.take(at), f.take(at).cov_p, f.cov_theta[at, 2, 2])
+    by_filter = _squares(f.take(at), s.take(at), f.take(at).cov_p, f.cov_theta[at, 2, 2])
     for what, (square, size, unit) in sizes.items():
-        k, mean = int(np.argmax(square)), float(np.mean(own[what]))
+        k, mean = int(np.argmax(square)), float(np.mean(by_filter[what]))
         yield Statistic(
             "separation",
             "dive",

@@ -86,9 +86,10 @@ def estimate_lever_arm(best: ChainOptimum) -> DvlPlace | None:
 
 def _is_turned(best: ChainOptimum) -> bool:
     """Whether the DVL's mounting is estimated far from its prior, as it is where axes are named wrongly."""
-    own = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
+    mounting = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
     return any(
-        abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > RULES["moved"].doubtful * b.sd for b in own
+        abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > RULES["moved"].doubtful * b.sd
+        for b in mounting
     )
 
 

@@ -152,7 +152,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
         **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
     }
     found = {check: [*known.get(check, check)(log, config)] for check in CHECKS}
-    findings = [finding for own in _without_consequences(found, log, config).values() for finding in own]
+    findings = [finding for of_check in _without_consequences(found, log, config).values() for finding in of_check]
     bursts = {f.sensor for f in findings if f.kind == "bursts"}  # whose stamps are late, too
     findings = [f for f in findings if f.kind != "lag" or not bursts & {"imu", f.sensor}]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)

@@ -165,7 +165,7 @@ class DvlAgainstImu:
         inertial, pinged = (flags[:, None].astype(float) for flags in (known, seen))
         pairs = np.triu_indices(3)
         count = np.maximum(sums(inertial, pinged)[0, 0], 1.0)
-        own = sums(_square(a)[:, None], pinged)[0, 0]
+        of_imu = sums(_square(a)[:, None], pinged)[0, 0]
         speed = sums(_square(w)[:, None], _square(mean)[:, None])[0, 0]
         speed += sums(inertial, _square(dy)[:, None])[0, 0]
         swing = sums(w, cross(mean, dy))
@@ -181,7 +181,7 @@ class DvlAgainstImu:
             2.0 * (np.linalg.det(ORIENTATIONS)[:, None, None] * ORIENTATIONS).reshape(shape) @ swing.reshape(9, -1)
         )
         mixed = ORIENTATIONS.reshape(shape) @ both.reshape(9, -1)
-        total = np.maximum(own + of_dvl, 1e-12)
+        total = np.maximum(of_imu + of_dvl, 1e-12)
         lags = np.arange(-reach, reach + 1, dtype=float) * step
         enough = count >= max(ENOUGH, OVERLAP * np.count_nonzero(known & seen))
         error = np.where(enough, (total - 2.0 * mixed) / count, np.inf)
@@ -243,14 +243,14 @@ class DvlAgainstImu:
         swing = change(swing_g)
         measured = (change(way_g) + swing - self._slow(middle, swing)) @ along
         part = _liveliest(middle, usable * (1e-12 + np.abs(measured) ** 2), TURNING_SECONDS) & usable
-        own, time = measured[part], middle[part] - middle[part][0]
+        inertial, time = measured[part], middle[part] - middle[part][0]
         gyro = np.exp(1.0j * np.outer(np.arange(-LARGEST_DRIFT, LARGEST_DRIFT, 1.0 / max(time[-1], 1.0)), time))
 
         def agreement(v: NDArray[np.complexfloating]) -> float:
             changes = change(np.column_stack([v.real, v.imag]))
             seen = (changes - self._slow(middle, changes))[part] @ (1.0, 1.0j)
-            total = float(np.vdot(own, own).real + np.vdot(seen, seen).real)
-            return float(2.0 * np.abs((gyro * own) @ seen.conj()).max() / max(total, 1e-12))
+            total = float(np.vdot(inertial, inertial).real + np.vdot(seen, seen).real)
+            return float(2.0 * np.abs((gyro * inertial) @ seen.conj()).max() / max(total, 1e-12))
 
         y = self.pings.data[:, 0] + 1.0j * self.pings.data[:, 1]
         senses = y, y.conj()

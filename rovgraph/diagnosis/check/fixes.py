@@ -347,10 +347,10 @@ def start(log: Log, config: Config) -> Iterator[Finding]:
         return
     away = np.hypot(first.data[:, 0] - (stated.north_m or 0.0), first.data[:, 1] - (stated.east_m or 0.0))
     way = _way(np.linalg.norm(pings.data[:, :2], axis=1), pings.time, begin, first.time)
-    own = float(np.nanmedian(np.where(np.isnan(first["fix_sd"]), config.fix.sd_m, first["fix_sd"])))
+    fix_sd = float(np.nanmedian(np.where(np.isnan(first["fix_sd"]), config.fix.sd_m, first["fix_sd"])))
     arm = float(np.hypot(*config.fix.lever_arm_m[:2]))
     beyond = float(np.median(away - way)) - arm
-    if beyond > SURE * np.hypot(stated.position_sd_m, own):
+    if beyond > SURE * np.hypot(stated.position_sd_m, fix_sd):
         yield Finding(
             "fix",
             "warning",
