@@ -326,8 +326,8 @@ class _Axis:
 
     def channels(self, recording: Recording) -> list[Channel]:
         """Of all sensors, on the common time."""
-        own = [channel for channel in recording.channels if channel.clock in self.lines]
-        return [_moved(channel, self.lines[channel.clock]) for channel in own]
+        channels = [channel for channel in recording.channels if channel.clock in self.lines]
+        return [_moved(channel, self.lines[channel.clock]) for channel in channels]
 
 
 @dataclass(frozen=True)
@@ -396,10 +396,10 @@ def join_clocks(
             raise InputError(_not_joined(waiting[0], base, pool, recordings, names))
     out = []
     for axis, line, sd, drift_sd, how in joined:
-        for name, own in axis.lines.items():
+        for name, to_axis in axis.lines.items():
             source, own_sd = axis.sources[name]
             told = ", ".join(text for text in (source if base.unix else "", how) if text) or "the log's clock"
-            lines = (own, line)
+            lines = (to_axis, line)
             shared = 0.0 if axis is base else axis.least_sd  # by all clocks of the file: that is in sd
             beyond = float(np.sqrt(max(own_sd**2 - shared**2, 0.0)))
             out.append(JoinedClock(axis.file, name, lines, float(np.hypot(beyond, sd)), drift_sd, told))
@@ -501,8 +501,8 @@ def _joined(
     """Onto the base's time: the line, its sd and that of its drift, how it was found, and a warning; None = not yet."""
     if stated is not None:
         return ClockLine(stated), 0.0, 0.0, f"shifted by {stated:+g} s as stated", ""
-    own = motion_of(channels)
-    found = [o for joined in pool if (o := find_offset(joined.motion, own)) is not None]
+    motion = motion_of(channels)
+    found = [o for joined in pool if (o := find_offset(joined.motion, motion)) is not None]
     offset = min(found, key=lambda each: each.sd, default=None)
     line = None if offset is None else _line(offset)
     if (known := _usual(axis, base, _span(channels), pool)) is not None:
@@ -568,9 +568,9 @@ def _not_joined(
 
 def _typical_stamp(recording: Recording, clock: str) -> float:
     """Median of a clock's stamps, of a thousand of each channel; NaN where it stamps nothing."""
-    own = [channel.columns["time"] for channel in recording.channels if channel.clock == clock]
-    own += [c.received for c in recording.channels if c.receiver == clock and c.received is not None]
-    stamps = np.concatenate([np.empty(0), *(every(times, max(len(times) // 1000, 1)) for times in own)])
+    series = [channel.columns["time"] for channel in recording.channels if channel.clock == clock]
+    series += [c.received for c in recording.channels if c.receiver == clock and c.received is not None]
+    stamps = np.concatenate([np.empty(0), *(every(times, max(len(times) // 1000, 1)) for times in series)])
     stamps = stamps[np.isfinite(stamps)]
     return float(np.median(stamps)) if len(stamps) else np.nan
 

@@ -133,14 +133,14 @@ class DataflashSource:
             return stored  # as it is: a copy would be as large
         return computed(lambda values: _scaled(values, scale), stored)
 
-    def time(self, own: str = "", documented: float = 1e-6) -> Array:
+    def time(self, counter: str = "", documented: float = 1e-6) -> Array:
         """Stamps [s] of messages `in_seconds`, shape (n,): a sample's own, a counter of 32 bits, where there is one."""
         time: Array = self.messages.fields["TimeUS"]
-        if own not in self.messages:
+        if counter not in self.messages:
             return time
-        stamp = self.si(own, documented)
+        stamp = self.si(counter, documented)
         some = max(len(stamp) // SOME, 1)
-        tick = float(np.median(every(stamp, some) / np.maximum(every(self.messages.fields[own], some), 1.0)))
+        tick = float(np.median(every(stamp, some) / np.maximum(every(self.messages.fields[counter], some), 1.0)))
         if not tick > 0.0:
             return time
 
@@ -211,11 +211,12 @@ def magnetometer(source: DataflashSource) -> Channel | None:
     sampled = [every(values, some) for values in field_]
     as_logged = _magnitude(sampled)
     raw = _magnitude([
-        _less(values, *(every(offset, some) for offset in own)) for values, own in zip(sampled, offsets, strict=True)
+        _less(values, *(every(offset, some) for offset in of_axis))
+        for values, of_axis in zip(sampled, offsets, strict=True)
     ])  # fmt: skip
     said = f"{source.label}: magnitude {as_logged:.0f} uT with the autopilot's offsets, {raw:.0f} uT without"
     if not low <= as_logged <= high and low <= raw <= high:
-        field_ = [computed(_less, values, *own) for values, own in zip(field_, offsets, strict=True)]
+        field_ = [computed(_less, values, *of_axis) for values, of_axis in zip(field_, offsets, strict=True)]
         source.findings.warnings.append(f"{said}: the offsets are taken off, as no place on Earth has the first")
     elif not low <= as_logged <= high:
         source.findings.warnings.append(f"{said}: no place on Earth has either; calibrate the magnetometer")
@@ -530,8 +531,8 @@ def _sources(
             continue
         numbers = all_.fields[field]
         for instance in sorted({each for (piece,) in in_pieces(numbers) for each in np.unique(piece).tolist()}):
-            own = computed(lambda each, instance=instance: each == instance, numbers)
-            part = all_ if own.all() else all_.take(own)
+            of_instance = computed(lambda each, instance=instance: each == instance, numbers)
+            part = all_ if of_instance.all() else all_.take(of_instance)
             found.append(DataflashSource(name, part, parameters, findings, f"{name} {instance}", instance))
     return found
 

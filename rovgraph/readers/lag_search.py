@@ -325,10 +325,10 @@ class Accelerations:
         moved, seen = _masked(np.column_stack(self._moved(grids[1])))
         dv, v = moved[:, :3], moved[:, 3:]
         # d a_i / d M_lk = delta_il dv_k + G_il v_k, of which these are the sums of products
-        own = _correlate(known, _products(dv, dv)).reshape(-1, 3, 3)
+        squared = _correlate(known, _products(dv, dv)).reshape(-1, 3, 3)
         mixed = _correlate(G, _products(dv, v)).reshape(-1, 3, 3, 3, 3)
         turned = _correlate(np.einsum("til,tim->tlm", G, G), _products(v, v)).reshape(-1, 3, 3, 3, 3)
-        normal = np.einsum("lm,tkn->tlkmn", np.eye(3), own) + np.einsum("tlmkn->tlkmn", mixed + turned)
+        normal = np.einsum("lm,tkn->tlkmn", np.eye(3), squared) + np.einsum("tlmkn->tlkmn", mixed + turned)
         normal = (normal + np.einsum("tmlnk->tlkmn", mixed)).reshape(-1, 81)
         right = _correlate(a, dv) + _correlate(np.einsum("til,ti->tl", G, a), v)
         # and those of the arm's part Y l, which only clock A has, with what it explains without the DVL

@@ -191,13 +191,13 @@ class MavlinkRows:
     def interleaved(self, names: Sequence[str], other: "MavlinkRows") -> "MavlinkRows":
         """Columns of one, and all of the other, in the order of messages; values missing in a row are NaN."""
         order = np.argsort(np.concatenate([self.place, other.place]), kind="stable")
-        own = {name: np.concatenate([self.columns[name], np.full(len(other), np.nan)]) for name in names}
+        of_self = {name: np.concatenate([self.columns[name], np.full(len(other), np.nan)]) for name in names}
         others = {name: np.concatenate([np.full(len(self), np.nan), v]) for name, v in other.columns.items()}
         place, received, stamp = (
             np.concatenate([getattr(self, name), getattr(other, name)])[order]
             for name in ("place", "received", "stamp")
         )
-        columns = {name: values[order] for name, values in (own | others).items()}
+        columns = {name: values[order] for name, values in (of_self | others).items()}
         return MavlinkRows(self.sender, f"{self.name} with {other.name}", place, received, stamp, columns)
 
 

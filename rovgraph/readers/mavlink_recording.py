@@ -114,8 +114,8 @@ class _Vehicle:
 
     def _boots(self) -> ReceiverClock | None:
         """Keep the longest run of the autopilot, and see how the receiver's clock went meanwhile."""
-        own = [r for (sender, name, _), r in self._rows.items() if sender == self.sender and name not in LATE]
-        booted = [r for r in own if len(r) and holds(np.isfinite, r.stamp) and r.stamp[-1] < 1e-6 * UNIX_USEC]
+        of_autopilot = [r for (sender, name, _), r in self._rows.items() if sender == self.sender and name not in LATE]
+        booted = [r for r in of_autopilot if len(r) and holds(np.isfinite, r.stamp) and r.stamp[-1] < 1e-6 * UNIX_USEC]
         if not booted:
             return None
         dense = max(booted, key=len)

@@ -205,8 +205,8 @@ def _stamped(recordings: Sequence[Recording], times: Mapping[str, str]) -> list[
 
 def _moved_as(time: Array, before: Channel, after: Channel) -> Array:
     """Times of a table, shape (n,) [s], moved as the stamps of a channel were."""
-    own, new = np.asarray(before.columns["time"], dtype=float), np.asarray(after.columns["time"], dtype=float)
-    place = {stamp: k for k, stamp in enumerate(own.tolist())}
+    old, new = np.asarray(before.columns["time"], dtype=float), np.asarray(after.columns["time"], dtype=float)
+    place = {stamp: k for k, stamp in enumerate(old.tolist())}
     rows = [place.get(stamp, -1) for stamp in time.tolist()]
     return np.array([new[k] if k >= 0 else np.nan for k in rows])
 

@@ -111,8 +111,8 @@ class MicroStrain:
 
     def recognise(self, path: Path, head: bytes) -> float:
         layout = _layout(head)
-        own = set() if layout is None else {_plain(name)[0] for name in layout.names} & OWN
-        return 0.9 if len(own) >= FEW and layout is not None and _is_theirs(layout.names) else 0.0
+        fields = set() if layout is None else {_plain(name)[0] for name in layout.names} & OWN
+        return 0.9 if len(fields) >= FEW and layout is not None and _is_theirs(layout.names) else 0.0
 
     def read(self, path: Path, options: ReadingOptions) -> Recording:
         with path.open("rb") as file:

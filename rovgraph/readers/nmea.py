@@ -372,23 +372,23 @@ class _Sentences:
             for name, rows in names.items():
                 self._left[name, "relative to a ship whose fixes are not in the file"] += len(rows) // 7
             return channels, []
-        own = next((name for name in fixes if name != options.choose.get("fix")), next(iter(fixes)))
+        receiver = next((name for name in fixes if name != options.choose.get("fix")), next(iter(fixes)))
         true = next((channel for name, channel in headings.items() if name.endswith(TRUE)), None)
         made = self._transponders(
-            names, _ship(fixes[own], true or self._ships_heading(place, time)), place, time, clock
+            names, _ship(fixes[receiver], true or self._ships_heading(place, time)), place, time, clock
         )
         if not made and options.choose.get("fix") not in fixes:
             left = self._left.items()
             why = "; ".join(f"{name}: {count} {reason}" for (name, reason), count in left if KIND in name)
             raise InputError(
                 f"{path}: holds acoustic positions, but none that can be placed ({why}); record the ship's heading "
-                f"(HDT) beside them, or say --choose fix={own} if that receiver is the vehicle's"
+                f"(HDT) beside them, or say --choose fix={receiver} if that receiver is the vehicle's"
             )
         labels = [*sorted(made, key=lambda name: -len(names[name])), *fixes]
         order = preferred_first(path, "fix", labels, options.choose)
         said = []
         if order[0] in made:
-            said.append(f"{order[0]} is added to {own}: see that it counts from the antenna of that receiver")
+            said.append(f"{order[0]} is added to {receiver}: see that it counts from the antenna of that receiver")
             if np.frombuffer(names[order[0]]).reshape(-1, 7)[:, -1].any():
                 said.append(f"{order[0]} {FILTERED}")
         if "ahrs" in options.choose:

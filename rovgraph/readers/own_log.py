@@ -78,10 +78,10 @@ def is_own_log(head: bytes, columns: Mapping[str, str] | None = None) -> bool:
     """
     if head.startswith(b"PAR1"):
         return True
-    own, header = dict(columns or {}), set(names_of(head))
+    mapping, header = dict(columns or {}), set(names_of(head))
     header |= {name_and_bracket(name)[0] for name in header}
     found = {name for name in header if is_column(name)} | {
-        own_name for own_name, name in own.items() if name in header
+        own_name for own_name, name in mapping.items() if name in header
     }
     return "time" in found and len(found) > 1
 
@@ -99,10 +99,10 @@ def _channels(cells: Mapping[str, Array]) -> list[Channel]:
         rows = np.any([~np.isnan(cells[c]) for c in present], axis=0)
         if not rows.any():
             continue
-        own = {name: cells[name][rows] for name in ("time", *present)}
+        filled = {name: cells[name][rows] for name in ("time", *present)}
         received = cells[RECEIVED][rows] if RECEIVED in cells else None
         receiver = "" if received is None else IN_RECEIVED
-        out.append(Channel(sensor, own, f"columns {', '.join(present)}", "", "time", received, receiver))
+        out.append(Channel(sensor, filled, f"columns {', '.join(present)}", "", "time", received, receiver))
     return out
 
 

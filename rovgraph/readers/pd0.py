@@ -321,8 +321,8 @@ def _receiver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _R
 def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Told | None:
     """Of sentences that WinRiver has decoded."""
     rows, ensemble = found.records_of(content, SENTENCES, BY_WINRIVER)
-    own = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"GGA")
-    rows, ensemble = rows[own], ensemble[own]
+    gga = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"GGA")
+    rows, ensemble = rows[gga], ensemble[gga]
     if not len(rows):
         return None
     time = _of_day([cell.decode("ascii", "replace") for cell in rows["time"]], stamps[ensemble])
@@ -345,7 +345,7 @@ def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _To
         for k, digits, away in ((2, 2, "S"), (4, 3, "W"))
     )
     range_sd = [RANGE_SD_M.get(int(row[6]) if row[6].isdigit() else 0, np.nan) for row in cells]
-    sd = np.array([own * (number(row[8]) or np.nan) for own, row in zip(range_sd, cells, strict=True)])
+    sd = np.array([of_range * (number(row[8]) or np.nan) for of_range, row in zip(range_sd, cells, strict=True)])
     lat[np.isnan(range_sd)] = np.nan
     return _Told("record 0x2101 (GGA)", time, np.zeros(len(time)), ensemble, lat, lon, sd)
 
@@ -368,9 +368,9 @@ def _by_vmdas(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _T
 def _headings(content: bytes | mmap.mmap, found: Ensembles, pinged: Array) -> tuple[Array, Array]:
     """Times and headings [rad] of HDT sentences; ``pinged`` is the Unix time of each ensemble [s]."""
     rows, ensemble = found.records_of(content, SENTENCES, HEADING_BY_WINRIVER)
-    own = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"HDT")
-    time, degrees = (pinged[ensemble] - rows["before"])[own], rows["heading"][own]
-    if not own.any():
+    hdt = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"HDT")
+    time, degrees = (pinged[ensemble] - rows["before"])[hdt], rows["heading"][hdt]
+    if not hdt.any():
         rows, ensemble = found.records_of(content, HEADING, TEXT)
         cells = [text.decode("ascii", "replace").split(",") for text in rows["text"]]
         told = [number(row[1]) if len(row) > 2 and row[0].endswith("HDT") else None for row in cells]
@@ -472,14 +472,14 @@ def _attitude(fixed: NDArray[np.void], system: NDArray[np.integer], rpy: Array) 
     Roll and pitch in ship axes that no sensor of its own measures were written in by the vehicle afterwards, as a REMUS
     does, and are not in the velocities: the depth in its files changes with its pitch, not with its vertical velocity.
     """
-    own = (fixed["source"] & LEVEL_SENSORS) == LEVEL_SENSORS
+    measured = (fixed["source"] & LEVEL_SENSORS) == LEVEL_SENSORS
     angle = np.where(fixed["beam_angle"] <= 45, fixed["beam_angle"], 0).astype(float)
     angle = np.where(angle > 0.0, angle, np.array(ANGLES)[(fixed["system"] >> 8) & 3])
     gimballed = rpy.copy()
-    gimballed[:, 1] = np.where(own, np.arctan(np.tan(rpy[:, 1]) * np.cos(rpy[:, 0])), rpy[:, 1])
+    gimballed[:, 1] = np.where(measured, np.arctan(np.tan(rpy[:, 1]) * np.cos(rpy[:, 0])), rpy[:, 1])
     return Attitude(
         rpy=gimballed,
-        tilted=(own | (system == EARTH)) & (fixed["coordinates"] & 0b100 != 0),
+        tilted=(measured | (system == EARTH)) & (fixed["coordinates"] & 0b100 != 0),
         upward=fixed["system"] & 0x80 != 0,
         beam_angle=np.deg2rad(angle),
         convex=fixed["system"] & 0x08 != 0,

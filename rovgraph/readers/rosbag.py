@@ -485,8 +485,8 @@ def _decoder(connection: Any, ros1: bool) -> Any:
             store.register(get_types_from_msg(definition.data, kind))
         else:
             store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-            own = {n: t for n, t in ALL_DEFINITIONS.items() if n.partition("/")[0] == kind.partition("/")[0]}
-            for name, text in own.items():
+            of_package = {n: t for n, t in ALL_DEFINITIONS.items() if n.partition("/")[0] == kind.partition("/")[0]}
+            for name, text in of_package.items():
                 store.register(get_types_from_msg(text, name))
     except Exception:  # whatever stands in the bag
         return None

@@ -177,10 +177,10 @@ class _File:
         """
         if clock not in first.recording.clocks or clock not in self.recording.clocks:
             return None
-        own, other = self.recording.unix_offset(clock), first.recording.unix_offset(clock)
-        if (own is None) != (other is None):
+        offset, other = self.recording.unix_offset(clock), first.recording.unix_offset(clock)
+        if (offset is None) != (other is None):
             return None
-        apart = 0.0 if own is None or other is None else own - other
+        apart = 0.0 if offset is None or other is None else offset - other
         return (apart if abs(apart) > SAME_S else 0.0) + self.shift - first.shift
 
 

@@ -59,10 +59,10 @@ def forward_starboard_down(values: Array, system: NDArray[np.integer], attitude:
     """
     values = np.where((system == BEAM)[:, None], _of_beams(values, attitude), values)
     velocity = values[:, FORWARD] * DOWN
-    own = (system == BEAM) | (system == INSTRUMENT)
-    velocity[own & attitude.upward] *= [1.0, -1.0, -1.0]  # turned over about the forward axis
+    of_instrument = (system == BEAM) | (system == INSTRUMENT)
+    velocity[of_instrument & attitude.upward] *= [1.0, -1.0, -1.0]  # turned over about the forward axis
     angles = attitude.rpy * np.column_stack([attitude.tilted, attitude.tilted, system == EARTH])
-    velocity[:] = np.where(own[:, None], velocity, (velocity[:, None] @ matrix_from_rpy(angles))[:, 0])
+    velocity[:] = np.where(of_instrument[:, None], velocity, (velocity[:, None] @ matrix_from_rpy(angles))[:, 0])
     return velocity, values[:, 3]
 
 

@@ -86,8 +86,8 @@ def _sentence(line: bytes) -> tuple[bytes, str, bytes] | None:
     if found is None:
         return None
     text, stated = found[2], found[5]
-    own = reduce(xor, text) if len(stated) == 2 else crc_hqx(text, 0)
-    return (found[1], found[3].decode(), found[4]) if int(stated, 16) == own else None
+    checksum = reduce(xor, text) if len(stated) == 2 else crc_hqx(text, 0)
+    return (found[1], found[3].decode(), found[4]) if int(stated, 16) == checksum else None
 
 
 class _Capture:
