@@ -195,9 +195,9 @@ class LiveAlarms:
         sd, columns = np.sqrt(np.diagonal(known.covariance)), engine.layout.columns
         for name in engine.unknowns.estimated:
             belief, variable = engine.beliefs[name], TABLE[name]
-            values, own, prior_sd = known.c[LAYOUT[name]], sd[columns[name]], np.full(variable.dim, belief.sd)
-            for k in np.flatnonzero(sds_moved(values, own, belief.mean, prior_sd) > RULES["moved"].doubtful):
-                numbers = float(values[k]), float(own[k]), float(belief.mean[k]), belief.sd
+            values, value_sd, prior_sd = known.c[LAYOUT[name]], sd[columns[name]], np.full(variable.dim, belief.sd)
+            for k in np.flatnonzero(sds_moved(values, value_sd, belief.mean, prior_sd) > RULES["moved"].doubtful):
+                numbers = float(values[k]), float(value_sd[k]), float(belief.mean[k]), belief.sd
                 estimate = CalibrationEstimate(variable.labels[k], variable.unit, variable.about, True, *numbers)
                 yield from moved_constant(estimate, self._start, time)
         if not engine.initial.config.environment.earth_rotation:
@@ -211,11 +211,11 @@ class LiveAlarms:
         begin, found = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces)), list[Statistic]()
         for sensor in [sensor for sensor in samples if sensor != PLACE]:
             self._pieces[-1][sensor] = _innovations(engine, sensor, samples[sensor])
-            own = [piece[sensor] for piece in self._pieces if sensor in piece]
+            of_sensor = [piece[sensor] for piece in self._pieces if sensor in piece]
             names = "time", "normalised", "weight", "shared"
-            arrays = (np.concatenate([getattr(one, name) for one in own]) for name in names)
+            arrays = (np.concatenate([getattr(one, name) for one in of_sensor]) for name in names)
             found += correlated_residuals_in(
-                SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start
+                SensorResiduals(sensor, of_sensor[0].components, *arrays), begin, time, self._start
             )
             yield self._lasting
         yield found

@@ -120,15 +120,15 @@ class Clocks:
         if self._stands_still(message, clock):
             base = clock if self._base is None else self._base
             return message.arrival - base.delay.value
-        own, processing = self._unwrapped(message.stamp, clock), message.latency or 0.0
-        stamp = own + clock.shift
+        unwrapped, processing = self._unwrapped(message.stamp, clock), message.latency or 0.0
+        stamp = unwrapped + clock.shift
         if self.trust:
             clock.delay.add(message.arrival, message.arrival - stamp - processing)
             return self._recorded(stamp, clock)
         if self._is_odd(clock, message.arrival, message.arrival - stamp - processing):
             self.odd += 1
             return None
-        stamp = own + clock.shift  # it may have been set
+        stamp = unwrapped + clock.shift  # it may have been set
         clock.delay.add(message.arrival, message.arrival - stamp - processing)
         return stamp + self._correction(clock, AGREE_S if message.latency is None else AGREE_SENT_S)
 
@@ -171,9 +171,9 @@ class Clocks:
         """Whether the stamps of a sensor stand still while its messages come."""
         assert message.stamp is not None
         sensor = message.readings[0].sensor if message.readings else ""
-        own = message.source, message.clock, sensor
-        if (moves := self._moves.get(own)) is None:
-            moves = self._moves[own] = _Moves(message.arrival, message.stamp)
+        key = message.source, message.clock, sensor
+        if (moves := self._moves.get(key)) is None:
+            moves = self._moves[key] = _Moves(message.arrival, message.stamp)
         if abs(message.stamp - moves.stamp) > STILL_RANGE_S:
             moves.arrival, moves.stamp, moves.count = message.arrival, message.stamp, 0
             if moves.still:

@@ -252,7 +252,7 @@ class Recorder:
         self._stop = threading.Event()
         names = recorded_columns()
         columns = {**STREAMS, GEODETIC: (*LAT_LON, "fix_sd"), "thruster": THRUSTERS}
-        self._places = {sensor: tuple(map(names.index, own)) for sensor, own in columns.items()}
+        self._places = {sensor: tuple(map(names.index, of_sensor)) for sensor, of_sensor in columns.items()}
         self._width = len(names)
         self._file = _opened(self.path, (",".join(names) + "\n").encode())
         self._threads = [

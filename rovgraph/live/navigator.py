@@ -130,8 +130,8 @@ class Navigator:
         if self.engine is None:
             self._hear(message)
         rows = self._intake.timed(time, message.readings)
-        for at, own in rows:
-            for reading in own:
+        for at, readings in rows:
+            for reading in readings:
                 if (measurement := self._intake.measurement(at, reading)) is not None:
                     self._consider(measurement)
         while self._intake.news:
@@ -403,9 +403,9 @@ class Navigator:
         """Estimated calibration by label: value and sd."""
         c, sd, columns = known.c.tolist(), np.sqrt(known.covariance.diagonal()).tolist(), engine.filter.layout.columns
         return {
-            label: (value, own)
+            label: (value, value_sd)
             for name in engine.filter.unknowns.estimated
-            for label, value, own in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
+            for label, value, value_sd in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
         }
 
     def _travelled(self, p_n: Array, sd: Array) -> float:
