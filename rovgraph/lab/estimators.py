@@ -235,8 +235,8 @@ def with_headings(log: Log, config: Config, letter: str) -> Config:
     InputError : the log lacks one of them
     """
     given = config.heading.sources or ()
-    own = "mag" not in log or ("ahrs" in given and "mag" not in given)
-    magnetometer, compass = ("ahrs" if own else "mag"), "dvl"
+    from_ahrs = "mag" not in log or ("ahrs" in given and "mag" not in given)
+    magnetometer, compass = ("ahrs" if from_ahrs else "mag"), "dvl"
     if letter in "ac" and magnetometer not in log:
         raise InputError(f"{log.source}: no magnetometer (mag_x, mag_y, mag_z, or ahrs_yaw)")
     if letter in "ab" and "dvl_heading" not in log:

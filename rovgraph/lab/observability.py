@@ -205,18 +205,18 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     before = np.array([np.concatenate(list(joint_prior_sd(dive, end).values())) for end in ends])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)
-    own = without_spurious_information(dive, ends, seen, before) if noisy else seen
+    information = without_spurious_information(dive, ends, seen, before) if noisy else seen
     variables = tuple(TABLE[name] for name in dive.unknowns.estimated for _ in TABLE[name].labels)
     labels = tuple(label for name in dive.unknowns.estimated for label in TABLE[name].labels)
     begin = float(dive.problem.time[0])
-    relative = np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))
+    relative = np.sqrt(np.diagonal(relative_covariance(information), axis1=1, axis2=2))
     return Observability(
         labels,
         variables,
         before[-1],
         np.sqrt(np.diag(known.calibration[-1])),
-        own[-1],
-        _correlation(known.covariance[-1], relative_covariance(own[-1]) * np.outer(before[-1], before[-1])),
+        information[-1],
+        _correlation(known.covariance[-1], relative_covariance(information[-1]) * np.outer(before[-1], before[-1])),
         dive.problem.time[ends] - begin,
         relative * before / before[-1],
     )
@@ -231,9 +231,9 @@ def _correlation(joint: Array, calibration: Array) -> Array:
     calibration : ndarray, shape (c, c), covariance without spurious information: what the others
         depend on the calibration stays, given that
     """
-    own, other = slice(OTHERS, None), slice(0, OTHERS)
-    slope = np.linalg.solve(joint[own, own], joint[own, other]).T
-    spread = joint[other, other] + slope @ (calibration - joint[own, own]) @ slope.T
+    of_c, other = slice(OTHERS, None), slice(0, OTHERS)
+    slope = np.linalg.solve(joint[of_c, of_c], joint[of_c, other]).T
+    spread = joint[other, other] + slope @ (calibration - joint[of_c, of_c]) @ slope.T
     both = np.concatenate([calibration, calibration @ slope.T], axis=1)
     sd = np.sqrt(np.concatenate([np.diag(calibration), np.diag(spread)]))
     return np.asarray(both / np.outer(sd[: len(calibration)], sd))
@@ -278,8 +278,8 @@ def in_words(information: Array, labels: Sequence[str], units: Sequence[str], pr
     heard = np.flatnonzero(alone <= UNOBSERVABLE_ABOVE).tolist()
     if not heard:
         return sentences
-    own = np.linalg.inv(relative_covariance(information)[np.ix_(heard, heard)]) - np.eye(len(heard))
-    found = directions(own)
+    of_heard = np.linalg.inv(relative_covariance(information)[np.ix_(heard, heard)]) - np.eye(len(heard))
+    found = directions(of_heard)
     names, kinds, sd = [labels[i] for i in heard], [units[i] for i in heard], prior_sd[heard]
     open_ones = found.axes[found.ratio > UNOBSERVABLE_ABOVE]
     sentences += [_combination(axis, names, kinds, sd) for axis in _apart(open_ones)]

@@ -120,8 +120,8 @@ class KnownComponents:
         out = np.zeros((len(labels), len(labels)))
         if both:
             there, here = (np.array(column) for column in zip(*both, strict=True))
-            own = np.linalg.inv(self.covariance[np.ix_(here, here)]) - np.diag(self.prior_sd[here] ** -2)
-            out[np.ix_(there, there)] = own * np.outer(sd[there], sd[there])
+            from_data = np.linalg.inv(self.covariance[np.ix_(here, here)]) - np.diag(self.prior_sd[here] ** -2)
+            out[np.ix_(there, there)] = from_data * np.outer(sd[there], sd[there])
         return out
 
 
@@ -242,14 +242,14 @@ def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
     """Predicted observability of a manoeuvre by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
-    own = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
+    as_written = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
     truth = Truth(
-        own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
+        as_written, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
     )  # fmt: skip
     dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
     log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
-    return examined(solved(log, own), own, noisy=False)
+    return examined(solved(log, as_written), as_written, noisy=False)
 
 
 def _with(already: Array, seen: Observability, manoeuvre: Manoeuvre) -> Prediction:

@@ -211,12 +211,12 @@ def _offsets(bins: Bins, label: NDArray[np.int64], length: float) -> tuple[Array
     before = np.minimum(place.astype(int), nodes - 2)
     share = place - before
     node = [3 * (before + i)[:, None, None] + np.arange(3)[None, None, :] for i in (0, 1)]
-    own = 3 * (nodes + label)[:, None, None] + np.arange(3)[None, None, :]
+    label_columns = 3 * (nodes + label)[:, None, None] + np.arange(3)[None, None, :]
     row = (3 * np.arange(n)[:, None] + np.arange(3))[:, :, None]
     parts = (
         (node[0], bins.R_t * (1.0 - share)[:, None, None]),
         (node[1], bins.R_t * share[:, None, None]),
-        (own, np.broadcast_to(np.eye(3), (n, 3, 3))),
+        (label_columns, np.broadcast_to(np.eye(3), (n, 3, 3))),
     )
     shape = (n, 3, 3)
     value, rows, columns = (

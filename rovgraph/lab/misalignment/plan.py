@@ -194,9 +194,9 @@ class Study(ConfigSection):
 
     def to_yaml(self) -> str:
         """As it was given, with the effective vehicle."""
-        own = {"name": self.name, "seed": self.seed, "runs": self.runs}
+        head = {"name": self.name, "seed": self.seed, "runs": self.runs}
         told = self.model_dump(mode="json", exclude_unset=True)
-        return yaml_text(own | told | {"vehicle": self.vehicle.model_dump(mode="json")})
+        return yaml_text(head | told | {"vehicle": self.vehicle.model_dump(mode="json")})
 
     def same_dives(self, other: "Study") -> bool:
         """Whether what it makes of a cell is the same, however many cells and runs either has."""

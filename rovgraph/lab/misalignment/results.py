@@ -275,6 +275,6 @@ def _tables(plan: Study, results: Results) -> Tables:
     cells = plan.all_cells()
     ids = [cell.id for cell in cells]
     runs = results.runs.settle(ids)
-    own = runs[runs["cell"].isin(ids) & (runs["run"] < plan.runs)].reset_index(drop=True)
-    history = results.history.settle(ids).merge(own[["cell", "run"]], on=["cell", "run"])
-    return Tables(plan, own, cell_table(own, cells), history)
+    of_study = runs[runs["cell"].isin(ids) & (runs["run"] < plan.runs)].reset_index(drop=True)
+    history = results.history.settle(ids).merge(of_study[["cell", "run"]], on=["cell", "run"])
+    return Tables(plan, of_study, cell_table(of_study, cells), history)

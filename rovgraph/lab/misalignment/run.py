@@ -138,8 +138,8 @@ class _Run:
 
     def _asked(self) -> dict[str, EstimatorSpec]:
         """Estimators that the study wants, what shares its keyframes side by side."""
-        own, held = CHAINS[self.task.cell.estimator]
-        asked = {"estimated": _own_headings(own)}
+        estimated, held = CHAINS[self.task.cell.estimator]
+        asked = {"estimated": _own_headings(estimated)}
         if self.task.study.history and self.task.cell.estimator in ("smoothed", "rts"):
             asked["history"] = _own_headings(CHAINS["filtered"][0])
         if self.task.study.held_track:
@@ -165,10 +165,12 @@ class _Run:
 
     def _history(self, made: dict[str, Outcome]) -> list[dict[str, Any]]:
         """Error and sd against time, of the filter that was asked for; none of a smoother."""
-        own = made.get("history") or made["estimated"]
-        if own.estimate is None or (own is made["estimated"] and self.task.cell.estimator in ("smoothed", "rts")):
+        outcome = made.get("history") or made["estimated"]
+        if outcome.estimate is None or (
+            outcome is made["estimated"] and self.task.cell.estimator in ("smoothed", "rts")
+        ):
             return []
-        known_yaw = own.estimate.history["dvl_yaw"]
+        known_yaw = outcome.estimate.history["dvl_yaw"]
         since = known_yaw.time - known_yaw.time[0]
         times = self.task.cell.duration_s * np.arange(1, HISTORY_TIMES + 1) / HISTORY_TIMES
         at = np.maximum(np.searchsorted(since, times, side="right") - 1, 0)

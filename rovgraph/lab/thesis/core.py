@@ -75,9 +75,9 @@ class Polynomials:
         c = np.zeros((len(members), len(unlike)))
         np.add.at(c.T, which.ravel(), np.concatenate([m._c for m in members]).T)
         c = c[:1] if (c == c[0]).all() else c
-        own = c.any(axis=0)
-        whole._places, whole._factors = unlike[own, 0].copy(), unlike[own, 1:].copy()
-        whole._c = np.ascontiguousarray(c[:, own])
+        used = c.any(axis=0)
+        whole._places, whole._factors = unlike[used, 0].copy(), unlike[used, 1:].copy()
+        whole._c = np.ascontiguousarray(c[:, used])
         return whole
 
     def __call__(self, x: Array) -> Linearized:

@@ -210,9 +210,9 @@ class ConstantAcceleration:
         self.layout = layout(*names)
         self._rate = self._right_hand_side()
         self._q = noise_per_second(self.layout, variant.numbers)
-        own = "body" if self._body else "earth"
+        frame = "body" if self._body else "earth"
         isotropic = len(set(variant.numbers.acceleration)) == 1
-        self._turned_noise = variant.noise_frame not in (None, own) and not isotropic
+        self._turned_noise = variant.noise_frame not in (None, frame) and not isotropic
 
     @classmethod
     def together(cls, members: Sequence[Self]) -> Self:

@@ -124,8 +124,8 @@ def timetable(samples: Sequence[Array], pings: Sequence[Array], longest: Sequenc
         number[there, b] = np.arange(len(before))
         active[at, b] = active[there, b] = True
         keeps_innovation[at[::KEEP_EVERY], b] = keeps_innovation[there, b] = True
-        own = np.flatnonzero(active[:, b])
-        keeps_state[own, b] = _keeps(time[own, b].tolist(), ping[own].tolist(), longest[b])
+        steps = np.flatnonzero(active[:, b])
+        keeps_state[steps, b] = _keeps(time[steps, b].tolist(), ping[steps].tolist(), longest[b])
     time, epoch = np.maximum.accumulate(time, axis=0), np.maximum.accumulate(epoch, axis=0)
     return Timetable(ping, active, time, epoch, number, keeps_state, keeps_innovation)
 
