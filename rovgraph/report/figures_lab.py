@@ -400,11 +400,11 @@ def draw_misalignment(history: pd.DataFrame) -> Figure | None:
     history = history.assign(error_deg=history["value_deg"] - true)
     figure, grid = _grid(names, 1.9, "time [s]", "[deg]", 3, one_scale=False)
     for axes, name in zip(grid, names, strict=True):
-        own = history[history["estimator"] == name]
-        for i, (_, rows) in enumerate(own.groupby("run", sort=False)):
+        of_estimator = history[history["estimator"] == name]
+        for i, (_, rows) in enumerate(of_estimator.groupby("run", sort=False)):
             _misalignment_line(axes, rows, i == 0)
         axes.axhline(0.0, color="black", lw=0.6, zorder=1)
-        late = own[own["time"] > SETTLED * own["time"].max()]
+        late = of_estimator[of_estimator["time"] > SETTLED * of_estimator["time"].max()]
         top = 1.1 * float((late["error_deg"].abs() + 2.0 * late["sd_deg"]).quantile(0.98)) or 1.0
         axes.set_ylim(-top, top)
         axes.set_xlim(0.0, float(history["time"].max()))

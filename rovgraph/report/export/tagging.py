@@ -64,10 +64,10 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
             f"column {column}: its times, {np.nanmin(time):.1f} to {np.nanmax(time):.1f} s, are all outside the dive, "
             f"{t.time[0]:.1f} to {t.time[-1]:.1f} s; state the difference of the clocks as an offset"
         )
-    own = Track(track.name, track.estimate, t.at(np.sort(time[inside])), track.origin)
+    at_rows = Track(track.name, track.estimate, t.at(np.sort(time[inside])), track.origin)
     order = np.argsort(np.argsort(time[inside], kind="stable"), kind="stable")
     frame = table.copy()
-    for name, values in _columns(own).iloc[order].items():
+    for name, values in _columns(at_rows).iloc[order].items():
         placed = np.full(len(table), np.nan)
         placed[inside] = values
         frame[f"{PLACED}{name}"] = placed

@@ -243,8 +243,8 @@ def _read_fixes(folder: Path) -> Fixes | None:
 
 def fixes_of(residuals: pd.DataFrame) -> Fixes | None:
     """The fixes among residuals (docs/results.md), None without any."""
-    own = residuals[residuals["sensor"] == "fix"]
-    north, east = (own[own["component"] == name] for name in ("north", "east"))
+    fixes = residuals[residuals["sensor"] == "fix"]
+    north, east = (fixes[fixes["component"] == name] for name in ("north", "east"))
     if not len(north) or len(north) != len(east):
         return None
     position = np.column_stack([north["measured"], east["measured"]]).astype(float)
