@@ -224,17 +224,19 @@ def settings_of_files(files: Sequence[Path], config: Config) -> list[FileSetting
     if len(files) == 1 and not config.files:
         return settings  # its reader names what it lacks
     names = [None if head.startswith(b"PAR1") else set(names_of(head)) for head in map(head_of, files)]
-    stated = [("", config.columns), *((pattern, own.columns) for pattern, own in config.files.items())]
+    stated = [("", config.columns), *((pattern, of_pattern.columns) for pattern, of_pattern in config.files.items())]
     for pattern, columns in stated:
-        theirs = {path: own for path, own in zip(files, names, strict=True) if not pattern or fits(path, pattern)}
+        theirs = {path: header for path, header in zip(files, names, strict=True) if not pattern or fits(path, pattern)}
         for target, source in columns.items():
-            if not any(own is None or source in own for own in theirs.values()):
-                near = nearest(source, [name for own in theirs.values() for name in own or ()])
+            if not any(header is None or source in header for header in theirs.values()):
+                near = nearest(source, [name for header in theirs.values() for name in header or ()])
                 where = ", ".join(path.name for path in theirs)
                 raise InputError(f"columns: {target}: no column {source!r} in {where}, nearest is {near!r}")
     return [
-        one if own is None else one.model_copy(update={"columns": {t: s for t, s in one.columns.items() if s in own}})
-        for one, own in zip(settings, names, strict=True)
+        one
+        if header is None
+        else one.model_copy(update={"columns": {t: s for t, s in one.columns.items() if s in header}})
+        for one, header in zip(settings, names, strict=True)
     ]
 
 
@@ -364,14 +366,14 @@ def proposal(guesses: Sequence[Guess]) -> str:
     sections: dict[str, Any] = {}
     reasons: dict[str, str] = {}
     for guess in guesses:
-        own: dict[str, Any] = {"columns": guess.mapping, "units": guess.units}
+        table: dict[str, Any] = {"columns": guess.mapping, "units": guess.units}
         above = f"files.{Path(guess.source).name}." if len(guesses) > 1 else ""
         reasons |= {f"{above}columns.{each.field}": f"{each.sureness}: {each.why}" for each in guess.proposed}
         for section, keys in guess.settings.items():
             of_table = section in TableSettings.model_fields
-            (own if of_table else sections).setdefault(section, {}).update(keys)
+            (table if of_table else sections).setdefault(section, {}).update(keys)
             reasons |= {f"{above if of_table else ''}{section}.{key}": REASONS[section] for key in keys}
-        stated = {name: section for name, section in own.items() if section}
+        stated = {name: section for name, section in table.items() if section}
         if len(guesses) > 1:
             sections.setdefault("files", {})[Path(guess.source).name] = stated
         else:
