@@ -192,11 +192,11 @@ def filter_alone(evidence: Evidence) -> Iterator[Statistic]:
     if evidence.main.kind != "smoothed":
         return
     for sensor, met in evidence.innovations.items():
-        taken = evidence.residuals.get(sensor)
-        if taken is None or len(taken.time) != len(met.time) or len(met.time) < ENOUGH:
+        smoothed = evidence.residuals.get(sensor)
+        if smoothed is None or len(smoothed.time) != len(met.time) or len(met.time) < ENOUGH:
             continue
         late = met.time > evidence.start + RULES["filter alone"].from_s
-        apart = (met.weight <= 0.0) & (taken.weight > 0.0) & late
+        apart = (met.weight <= 0.0) & (smoothed.weight > 0.0) & late
         share = float(share_rejected(np.array([apart.sum()]), np.array([late.sum()]))[0])
         first, last = (float(t) for t in (met.time[apart][[0, -1]] if apart.any() else (evidence.start, evidence.end)))
         yield Statistic(
@@ -247,9 +247,9 @@ def _allowing(r: SensorResiduals, evidence: Evidence) -> SensorResiduals:
     if not isinstance(best, ChainOptimum) or r.sensor not in best.blocks:
         return r
     block, shared = best.blocks[r.sensor], np.zeros_like(r.normalised)
-    here = block.normalised(best.state.at(block.keyframe))
+    normalised = block.normalised(best.state.at(block.keyframe))
     for moved in best.moved_by_considered():
-        shared += (block.normalised(moved.at(block.keyframe)) - here) ** 2
+        shared += (block.normalised(moved.at(block.keyframe)) - normalised) ** 2
     return replace(r, shared=shared[np.argsort(block.time, kind="stable")])
 
 

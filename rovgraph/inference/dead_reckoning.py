@@ -126,9 +126,9 @@ def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
     """The epochs of all keyframes and of some sensors."""
     n = len(problem)
     wanted = np.isin(problem.which, [k for k, sensor in enumerate(problem.sensors) if sensor in sensors])
-    found = np.flatnonzero(wanted)
-    interval, rows = problem.interval[found], problem.rows[found]
-    here = problem.keyframe[found] == interval
+    measured = np.flatnonzero(wanted)
+    interval, rows = problem.interval[measured], problem.rows[measured]
+    here = problem.keyframe[measured] == interval
     # in an interval first what lies between the keyframes, then its own, then what is measured there
     order = np.argsort(np.concatenate([3 * np.arange(n) + 1, 3 * interval + 2 * here]), kind="stable")
     place = np.empty(len(order), np.intp)
@@ -153,7 +153,7 @@ def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
         problem.coasted[of],
         keyframe,
         problem,
-        found,
+        measured,
         k,
     )
 
@@ -269,10 +269,10 @@ def _depths(
     calibration: Mapping[str, Array],
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
-    found = problem.of_sensor("depth")
-    if not len(found):
+    index = problem.of_sensor("depth")
+    if not len(index):
         return integrated
     arm = initial.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
-    depth = np.interp(problem.time, problem.rows[found, TIME], problem.z(found, 1)[:, 0]) - calibration["depth_offset"]
+    depth = np.interp(problem.time, problem.rows[index, TIME], problem.z(index, 1)[:, 0]) - calibration["depth_offset"]
     depth /= 1.0 + calibration["depth_scale"]
     return np.asarray(depth - rotate(R_nb, arm)[:, 2])

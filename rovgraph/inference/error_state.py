@@ -96,10 +96,10 @@ class FilterHistory:
         """Take the intervals that a filter has run through."""
         if not len(run):
             return
-        found = run.filtered
-        self._met.append(_Part(run.states, found.nis, found.weight, np.empty((0, 2))))
+        filtered = run.filtered
+        self._met.append(_Part(run.states, filtered.nis, filtered.weight, np.empty((0, 2))))
         self._count += len(run)
-        self._pieces.append((found.x, found.c, found.pose, found.velocity, found.sd))
+        self._pieces.append((filtered.x, filtered.c, filtered.pose, filtered.velocity, filtered.sd))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""

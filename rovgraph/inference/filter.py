@@ -212,8 +212,8 @@ class ErrorLayout:
         estimated = np.flatnonzero((self.column >= 0) & (self.column < self.size))
         columns = estimated[np.argsort(self.column[estimated])]
         names = {name for name, part in self.columns.items() if part.stop <= self.size}
-        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in names}
-        models = [(model, self.columns[variable]) for variable, model in shown.items()]
+        seen_models = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in names}
+        models = [(model, self.columns[variable]) for variable, model in seen_models.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
         params = np.zeros((len(models), max((model.packed.shape[1] for model, _ in models), default=0)))
         for row, (model, _) in zip(params, models, strict=True):
@@ -462,9 +462,9 @@ class FilterEngine:
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""
-        there = _state(replace(known, P=P, B=known.B if B is None else B))
-        move_estimate(there, delta, self.layout.coordinates)
-        return _estimate(there, moved(known.places, delta[self.layout.size :]))
+        state = _state(replace(known, P=P, B=known.B if B is None else B))
+        move_estimate(state, delta, self.layout.coordinates)
+        return _estimate(state, moved(known.places, delta[self.layout.size :]))
 
     def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
         """The error, shape (size,), that leads from one estimate to another, and the basis, shape (size, size).

@@ -94,5 +94,5 @@ def _without_rate_noise(best: ChainOptimum, released: list[ScoreTest]) -> list[S
     step, sd = np.array([(one.step, one.sd) for one in arm]).T
     spurious = spurious_information(best)
     steps, sds = spurious.step(step, sd), spurious.sd(sd)
-    shown = [replace(one, step=float(a), sd=float(b)) for one, a, b in zip(arm, steps, sds, strict=True) if b < np.inf]
-    return [one for one in released if one.name != ARM] + shown
+    of_arm = [replace(one, step=float(a), sd=float(b)) for one, a, b in zip(arm, steps, sds, strict=True) if b < np.inf]
+    return [one for one in released if one.name != ARM] + of_arm

@@ -219,10 +219,10 @@ def _silence(streams: Streams, dive: DiveArrays, rule: KeyframeRule, time: float
     """Keyframes for a time without pings, wherever it is longer than ``longest`` [s]."""
     while time - dive.keyframes[dive.counts[KEYFRAMES] - 1, TIME] > longest:
         last = dive.keyframes[dive.counts[KEYFRAMES] - 1]
-        there, upto = last[TIME] + rule.max_gap, int(last[UPTO])
-        while upto < looked and streams.events[streams.order[upto], PLACED] <= there:
+        due, upto = last[TIME] + rule.max_gap, int(last[UPTO])
+        while upto < looked and streams.events[streams.order[upto], PLACED] <= due:
             upto += 1
-        _stand(dive, rule, there, upto, 0)
+        _stand(dive, rule, due, upto, 0)
 
 
 @helper
@@ -376,13 +376,13 @@ def _learn(keyframes: Array, k: int, acc: float, gyr: float) -> None:
             seen[count] = keyframes[j, SCATTER : SCATTER + 2]
             count += 1
         j -= 1
-    shown = (acc, gyr)
+    noise = (acc, gyr)
     if count >= ENOUGH:
         middle = np.sort(seen[:count, 0])[count // 2], np.sort(seen[:count, 1])[count // 2]
-        shown = (middle[0] if middle[0] > NOISIER * acc else acc, middle[1] if middle[1] > NOISIER * gyr else gyr)
+        noise = (middle[0] if middle[0] > NOISIER * acc else acc, middle[1] if middle[1] > NOISIER * gyr else gyr)
     believed = keyframes[k, BELIEVED : BELIEVED + 2]
-    if max(abs(shown[0] / believed[0] - 1.0), abs(shown[1] / believed[1] - 1.0)) > CHANGED:
-        believed[0], believed[1] = shown
+    if max(abs(noise[0] / believed[0] - 1.0), abs(noise[1] / believed[1] - 1.0)) > CHANGED:
+        believed[0], believed[1] = noise
 
 
 @helper

@@ -269,7 +269,7 @@ def _import_in(worker: subprocess.Popen[str], module: str) -> bool:
 
 def _awaited(module: str, among: set[str]) -> int:
     """Size of the largest module that imports this one: the parts of the largest come first."""
-    return max(len(_imported_kernels(whole)) for whole in among if module in _imported_kernels(whole))
+    return max(len(_imported_kernels(importer)) for importer in among if module in _imported_kernels(importer))
 
 
 @contextlib.contextmanager

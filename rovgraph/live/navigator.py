@@ -162,9 +162,9 @@ class Navigator:
             self._reinitialisations.patient = True
         for measurement in log.measurements():
             if measurement.time > known:
-                taken = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
-                if taken is not None:
-                    self._consider(taken, by_hand=taken.sensor == "fix")  # some may be
+                accepted = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
+                if accepted is not None:
+                    self._consider(accepted, by_hand=accepted.sensor == "fix")  # some may be
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
 
@@ -297,8 +297,8 @@ class Navigator:
             from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
             self.isam2 = IncrementalEstimator(initial, UPDATE_S)
-        whole = self.smooth or self._reinitialisations is not None
-        self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, True, whole)
+        keeps_all = self.smooth or self._reinitialisations is not None
+        self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, True, keeps_all)
         if state is not None:
             self.engine.restore(state)
             return

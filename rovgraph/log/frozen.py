@@ -490,10 +490,10 @@ def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | Non
     turning : rate of turn that the gyro shows at rest [rad/s]; None = the median of the log
     """
     long = runs.are_long(HOLDS[sensor])
-    if not long.any() or (shown := _motion_shown(sensor, runs, long, log, config, turning)) is None:
+    if not long.any() or (evidence := _motion_shown(sensor, runs, long, log, config, turning)) is None:
         return
     for k in np.flatnonzero(long).tolist():
-        if why := shown(EqualRun(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
+        if why := evidence(EqualRun(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
             yield k, why
 
 

@@ -481,8 +481,8 @@ class Assembly:
         """Of some of the events, those that are left out."""
         events = self._events[some]
         events = events[events[:, at.FATE] != at.IN][:, [at.SENSOR, at.FATE]].astype(np.int64)
-        found, counts = np.unique(events, axis=0, return_counts=True) if len(events) else (events, events[:, 0])
-        each = zip(found.tolist(), counts.tolist(), strict=True)
+        kinds, counts = np.unique(events, axis=0, return_counts=True) if len(events) else (events, events[:, 0])
+        each = zip(kinds.tolist(), counts.tolist(), strict=True)
         return Counter({(self.names[k], self._why(k, fate)): n for (k, fate), n in each})
 
     def _why(self, sensor: int, fate: int) -> str:

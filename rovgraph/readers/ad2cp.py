@@ -100,19 +100,19 @@ def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[Norte
     It is the bottom that moves here, away from the instrument where positive.
     """
     at, size = found.at.get(SIGNATURE, []), found.size.get(SIGNATURE, [])
-    said, _ = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
-    count = len(said)
+    records, _ = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
+    count = len(records)
     empty = np.full((count, 4), np.nan)
-    whole = (said["beams"] >> 12 == 4) & (said["config"] & HAS_VELOCITY != 0)
+    whole = (records["beams"] >> 12 == 4) & (records["config"] & HAS_VELOCITY != 0)
     parts = {}
-    start = np.array(at, dtype=np.int64) + said["offset"]
+    start = np.array(at, dtype=np.int64) + records["offset"]
     end = np.array(at, dtype=np.int64) + np.array(size, dtype=np.int64)
     for name, bit, kind in (
         ("velocity", HAS_VELOCITY, "<i4"),
         ("distance", HAS_DISTANCE, "<i4"),
         ("merit", HAS_MERIT, "<u2"),
     ):
-        there = whole & (said["config"] & bit != 0)
+        there = whole & (records["config"] & bit != 0)
         fields = layout(("value", f"4{kind}", 0))
         values, read = gathered(
             content, fields, np.where(there, start, -1).tolist(), (end - start).tolist(), fields.itemsize
@@ -120,15 +120,15 @@ def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[Norte
         parts[name] = np.where(read[:, None], values["value"], np.nan).astype(float)
         start = start + np.where(there, fields.itemsize, 0)
     heard = (parts["merit"] != NO_MERIT) & (parts["distance"] > 0.0)
-    raw = np.where(heard, parts["velocity"] * 10.0 ** said["scale"][:, None].astype(float), np.nan)
-    system = (said["beams"] >> 10) & 3
+    raw = np.where(heard, parts["velocity"] * 10.0 ** records["scale"][:, None].astype(float), np.nan)
+    system = (records["beams"] >> 10) & 3
     velocity = np.where((system == BEAM)[:, None], _of_beams(raw), np.column_stack([raw[:, :2], _either(raw[:, 2:])]))
     turned = system == ENU
-    rpy = np.deg2rad(0.01 * np.column_stack([said[name].astype(float) for name in ("roll", "pitch", "heading")]))
+    rpy = np.deg2rad(0.01 * np.column_stack([records[name].astype(float) for name in ("roll", "pitch", "heading")]))
     velocity[turned] = _of_enu(velocity[turned], rpy[turned])
     known = system <= BEAM
     velocity[~known] = np.nan
-    time = _time(said["date"], said["fraction"])
+    time = _time(records["date"], records["fraction"])
     merit = np.where(heard, 1e-3 * parts["merit"], np.nan)
     distance = np.where(heard, 1e-3 * parts["distance"], np.nan)
     track = NortekTrack(time, np.zeros(count), -velocity, empty[:, :3], distance, raw, merit)
@@ -156,25 +156,27 @@ def _of_beams(beams: Array) -> Array:
 
 def _either(pair: Array) -> Array:
     """Mean of two measurements of one axis, shape (n,); either one where the other is missing."""
-    there = np.isfinite(pair).sum(axis=1)
-    return np.where(there > 0, np.nansum(pair, axis=1) / np.maximum(there, 1), np.nan)
+    count = np.isfinite(pair).sum(axis=1)
+    return np.where(count > 0, np.nansum(pair, axis=1) / np.maximum(count, 1), np.nan)
 
 
 def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> NortekTrack:
     """Bottom or water track of a DVL: by the status for validity, two estimates of Z are averaged."""
-    said, there = gathered(content, DVL_FIELDS, found.at.get(kind, []), found.size.get(kind, []), DVL_FIELDS.itemsize)
-    said = said[there]
-    status = said["status"]
-    velocity = where_bits(said["velocity"], status, 12)
-    sd = where_bits(said["sd"], status, 16)
+    records, there = gathered(
+        content, DVL_FIELDS, found.at.get(kind, []), found.size.get(kind, []), DVL_FIELDS.itemsize
+    )
+    records = records[there]
+    status = records["status"]
+    velocity = where_bits(records["velocity"], status, 12)
+    sd = where_bits(records["sd"], status, 16)
     return NortekTrack(
-        time=_time(said["date"], said["fraction"]),
-        delay=said["delay"][:, 0].astype(float),
+        time=_time(records["date"], records["fraction"]),
+        delay=records["delay"][:, 0].astype(float),
         velocity=np.column_stack([velocity[:, :2], _either(velocity[:, 2:])]),
         sd=np.column_stack([sd[:, :2], _either(sd[:, 2:])]),
-        distance=where_bits(said["distance"], status, 4),
-        beams=where_bits(said["beams"], status, 0),
-        merit=where_bits(said["merit"], status, 8),
+        distance=where_bits(records["distance"], status, 4),
+        beams=where_bits(records["beams"], status, 0),
+        merit=where_bits(records["merit"], status, 8),
     )
 
 
@@ -186,11 +188,11 @@ def _time(date: NDArray[np.uint8], fraction: NDArray[np.uint16]) -> Array:
 
 def _attitude(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
     at, size = found.at.get(SIGNATURE, []), found.size.get(SIGNATURE, [])
-    said, there = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
+    records, there = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
     if not there.any():
         return
-    time = _time(said["date"], said["fraction"])
-    heading, pitch, roll = (np.deg2rad(0.01 * said[name].astype(float)) for name in ("heading", "pitch", "roll"))
+    time = _time(records["date"], records["fraction"])
+    heading, pitch, roll = (np.deg2rad(0.01 * records[name].astype(float)) for name in ("heading", "pitch", "roll"))
     source = "bottom track 0x17"
     yield Channel("dvl_heading", {"time": time, "dvl_heading": wrap_angle(heading)}, f"{source}: heading", "", CLOCK)
     yield Channel("vehicle_tilt", {"time": time, "roll": roll, "pitch": pitch}, f"{source}: roll, pitch", "", CLOCK)
@@ -201,10 +203,10 @@ def _depth(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
         (DVL_BOTTOM, DVL_FIELDS, BAR),
         (SIGNATURE, SIGNATURE_FIELDS, 1e-3 * 0.1 * BAR),
     ):
-        said, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
+        records, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
         if there.any():
-            depth = to_pascal * said["pressure"].astype(float) / (FRESH * GRAVITY)
-            time = _time(said["date"], said["fraction"])
+            depth = to_pascal * records["pressure"].astype(float) / (FRESH * GRAVITY)
+            time = _time(records["date"], records["fraction"])
             yield Channel("depth", {"time": time, "depth": depth}, f"bottom track {kind:#x}: pressure", "", CLOCK)
 
 

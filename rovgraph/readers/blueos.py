@@ -106,8 +106,8 @@ def _sender(parts: list[str]) -> Sender:
 def _take(gatherer: Gatherer, data: bytes, received: float) -> None:
     """Count a message, and take it if it has sensor data."""
     try:
-        said = json.loads(data)
-        header, fields = said["header"], said["message"]
+        envelope = json.loads(data)
+        header, fields = envelope["header"], envelope["message"]
         sender, name = (int(header["system_id"]), int(header["component_id"])), str(fields["type"])
         gatherer.counts[sender, name] += 1
         if name in WANTED:

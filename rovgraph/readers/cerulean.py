@@ -62,9 +62,9 @@ class Cerulean:
         with path.open("rb") as file:
             while line := file.readline(LONGEST):
                 options.progress(min(file.tell(), size), size)
-                said = ping(line)
-                if said is not None:
-                    rows.append((said[0], *said[1].values()))
+                report = ping(line)
+                if report is not None:
+                    rows.append((report[0], *report[1].values()))
                 elif line.strip():
                     found = SENTENCE.search(line)
                     lost[found[1].decode() if found else "a line that is no whole sentence"] += 1

@@ -173,16 +173,16 @@ def _refined(comparison: SignalPair, lag: float, parameters: Array) -> tuple[Off
     begin, end = max(begin_a, begin_b - lag), min(end_a, end_b - lag)
     step, at = coarse_step(comparison), 0.5 * (begin + end)
     times = np.arange(begin, end, step)
-    shown = comparison.observed(times)
+    observed = comparison.observed(times)
     seconds, drift, farthest = lag, 0.0, LARGEST_STEP * comparison.window
-    fit = _step(comparison, times - at, times, shown, (seconds, drift), parameters, held=True)
+    fit = _step(comparison, times - at, times, observed, (seconds, drift), parameters, held=True)
     for k in range(ITERATIONS):
         if fit is None:
             return None
         seconds, drift = seconds + float(np.clip(fit.move[0], -farthest, farthest)), drift + float(fit.move[1])
         parameters = comparison.moved(parameters, fit.move[2:])
         settled = k > HELD and abs(fit.move[0]) < SETTLED
-        fit = _step(comparison, times - at, times, shown, (seconds, drift), parameters, held=k < HELD)
+        fit = _step(comparison, times - at, times, observed, (seconds, drift), parameters, held=k < HELD)
         if settled:
             break
     if fit is None:

@@ -242,8 +242,8 @@ class Gatherer:
                 known.setdefault(message.param_id if parameter else "COMPASS_DEC", value)
             return
         stamp = 1e-6 * usec(message) or np.nan
-        for said in READERS[name](message):
-            row, key = (self._taken, received, stamp, *said.values), (sender, name, said.sensor)
+        for reading in READERS[name](message):
+            row, key = (self._taken, received, stamp, *reading.values), (sender, name, reading.sensor)
             if (rows := self._flat.get(key)) is None:
                 rows = self._flat[key] = FlatTable(len(row))
             rows.append(row)

@@ -158,10 +158,10 @@ class _Vehicle:
         }
         for sensor, (sources, make) in makers.items():
             for place, name in enumerate(preferred_first(self._path, sensor, list(sources), self._choose)):
-                said = len(self.notes), len(self.warnings)
+                counts = len(self.notes), len(self.warnings)
                 yield from make(sensor, sources[name])
                 if place:  # unused ones get no warning
-                    del self.notes[said[0] :], self.warnings[said[1] :]
+                    del self.notes[counts[0] :], self.warnings[counts[1] :]
 
     def _own(self, kind: str) -> dict[str, MavlinkRows]:
         """The autopilot's values of a sensor, by the names of messages, those in `IMUS` in its order."""

@@ -183,8 +183,8 @@ class Nmea:
         if len(head) - len(head.translate(None, CONTROL)) > BINARY * len(head):
             return 0.0
         lines = [line for line in head.split(b"\n")[:50] if line.strip() and not line.startswith(b"#")]
-        whole = sum(b"$" in line and b"," in line and _is_sentence(line) for line in lines)
-        return 0.8 if whole >= min(FEW, len(lines)) and 2 * whole >= len(lines) > 0 else 0.0
+        sentences = sum(b"$" in line and b"," in line and _is_sentence(line) for line in lines)
+        return 0.8 if sentences >= min(FEW, len(lines)) and 2 * sentences >= len(lines) > 0 else 0.0
 
     def read(self, path: Path, options: ReadingOptions) -> Recording:
         library()

@@ -86,22 +86,22 @@ class Nucleus:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         found = find_records(content, NUCLEUS_FAMILIES, lambda done: options.progress(done, len(content)))
-        said = {kind: said_of(content, found, kind) for kind in KINDS}
-        stamped = [each.common["flags"] & 1 for each in said.values() if len(each.time)]
+        records = {kind: said_of(content, found, kind) for kind in KINDS}
+        stamped = [each.common["flags"] & 1 for each in records.values() if len(each.time)]
         unix = bool(stamped) and all(flags.all() for flags in stamped)
         clock = Clock(POSIX, 0.0, 1.0, "its stamps are Unix time") if unix else Clock(BOOT)
-        channels = tuple(channels_of(said, clock.name, alone=not len(said[IMU].time)))
+        channels = tuple(channels_of(records, clock.name, alone=not len(records[IMU].time)))
         if not channels:
             raise InputError(f"{path}: holds no measurement of a sensor; switch on the IMU, AHRS and bottom track data")
         settings: dict[str, Any] = {}
-        declination = said[AHRS].values["declination"]
+        declination = records[AHRS].values["declination"]
         if len(declination) and np.isfinite(declination[0]) and declination[0]:
             settings["environment"] = {"declination_deg": round(float(declination[0]), 3)}
         mixed = stamped and not unix and any(flags.any() for flags in stamped)
         more = ["its clock was set meanwhile: stamps are of two clocks"] if mixed else []
-        tables = {BEAMS: beam_table(track_of(said[BOTTOM]))} if len(said[BOTTOM].time) else {}
+        tables = {BEAMS: beam_table(track_of(records[BOTTOM]))} if len(records[BOTTOM].time) else {}
         return Recording(
-            str(path), self.name, channels, {clock.name: clock}, tuple(_left(found, said)), settings,
+            str(path), self.name, channels, {clock.name: clock}, tuple(_left(found, records)), settings,
             warnings=(*more, *_warnings(found, channels)), tables=tables,
         )  # fmt: skip
 

@@ -495,8 +495,8 @@ def _time(date: NDArray[np.uint8], century: NDArray[np.uint8]) -> Array:
     """Seconds since 1970 of calendar dates, of which years may have two digits; NaN for invalid ones."""
     year, month, day, hour, minute, second, hundredths = date.astype(np.int64).T
     full = np.where((century == 19) | (century == 20), 100 * century.astype(np.int64), 2000) + year
-    whole = unix_of_calendar(full, month, day, hour, minute, second)
-    return np.where((year < 100) & (hundredths < 100), whole + 0.01 * hundredths, np.nan)
+    seconds = unix_of_calendar(full, month, day, hour, minute, second)
+    return np.where((year < 100) & (hundredths < 100), seconds + 0.01 * hundredths, np.nan)
 
 
 def _left(found: Ensembles) -> Iterator[Left]:

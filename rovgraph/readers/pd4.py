@@ -119,13 +119,13 @@ def decoded(frames: NDArray[np.uint8]) -> tuple[Pings, dict[str, int]]:
     ----------
     frames : ndarray, shape (n, 88); PD4 is filled up with zeros
     """
-    said = np.ascontiguousarray(frames[:, : FRAME.itemsize]).view(FRAME)[:, 0]
-    of_five = said["kind"] == 1
-    rpy = np.deg2rad(0.01 * np.column_stack([said[name].astype(float) for name in ("roll", "pitch", "heading")]))
+    records = np.ascontiguousarray(frames[:, : FRAME.itemsize]).view(FRAME)[:, 0]
+    of_five = records["kind"] == 1
+    rpy = np.deg2rad(0.01 * np.column_stack([records[name].astype(float) for name in ("roll", "pitch", "heading")]))
     rpy[~of_five] = np.nan
-    system = said["system"] >> 6
-    tilted = (said["system"] & 0x20 != 0) & (system >= SHIP)
-    values, water = (_velocities(said[name]) for name in ("velocity", "water"))
+    system = records["system"] >> 6
+    tilted = (records["system"] & 0x20 != 0) & (system >= SHIP)
+    values, water = (_velocities(records[name]) for name in ("velocity", "water"))
     refused = {}
     for reason, rows in (
         ("beam coordinates of PD4 and PD5 have no defined sign; set EX to instrument or ship", system == BEAM),
@@ -135,27 +135,27 @@ def decoded(frames: NDArray[np.uint8]) -> tuple[Pings, dict[str, int]]:
         if rows.any():
             refused[reason] = int(np.count_nonzero(rows))
             values[rows] = water[rows] = np.nan
-    usual = np.full(len(said), False)
-    attitude = Attitude(np.nan_to_num(rpy), tilted, usual, np.full(len(said), np.pi / 6.0), ~usual)
+    usual = np.full(len(records), False)
+    attitude = Attitude(np.nan_to_num(rpy), tilted, usual, np.full(len(records), np.pi / 6.0), ~usual)
     system = np.where(system == BEAM, INSTRUMENT, system)
     velocity, error = forward_starboard_down(values, system, attitude)
     through, _ = forward_starboard_down(water, system, attitude)
     return Pings(
-        time=_time(said["clock"]),
+        time=_time(records["clock"]),
         system=system,
         velocity=velocity,
         water=through,
         error=error,
         rpy=rpy,
-        bias=np.zeros(len(said)),
-        alignment=np.zeros(len(said)),
+        bias=np.zeros(len(records)),
+        alignment=np.zeros(len(records)),
         tilted=tilted,
-        depth=np.where(of_five, 0.1 * said["depth"], np.nan),
-        range=np.where(said["range"] > 0, 0.01 * said["range"], np.nan),
-        beams=np.full((len(said), 4), np.nan),
+        depth=np.where(of_five, 0.1 * records["depth"], np.nan),
+        range=np.where(records["range"] > 0, 0.01 * records["range"], np.nan),
+        beams=np.full((len(records), 4), np.nan),
         quality={},
-        position=np.full((len(said), 2), np.nan),
-        tracked=np.full(len(said), True),
+        position=np.full((len(records), 2), np.nan),
+        tracked=np.full(len(records), True),
     ), refused
 
 

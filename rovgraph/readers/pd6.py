@@ -93,8 +93,8 @@ class Pd6Sentences:
                 raise ValueError
             velocity = velocity @ matrix_from_rpy(self._rpy)
         values = velocity if good else np.full(3, np.nan)
-        said = dict(zip(COLUMNS[tag[0]], values.tolist(), strict=True))
-        return said | ({"dvl_valid": float(good)} if tag[0] == "B" else {})
+        columns = dict(zip(COLUMNS[tag[0]], values.tolist(), strict=True))
+        return columns | ({"dvl_valid": float(good)} if tag[0] == "B" else {})
 
 
 SENSORS = {
@@ -125,13 +125,13 @@ class PD6:
             while line := file.readline(LONGEST):
                 done += len(line)
                 options.progress(done, size)
-                said = sentences.columns(line)
-                if said is None:
+                cells = sentences.columns(line)
+                if cells is None:
                     lost["a line that is no whole sentence"] += bool(line.strip())
-                elif said and sentences.time is None:
+                elif cells and sentences.time is None:
                     lost["before the first time (:TS)"] += 1
-                elif said and sentences.time is not None:
-                    _keep(rows, sentences.time, said)
+                elif cells and sentences.time is not None:
+                    _keep(rows, sentences.time, cells)
         channels = tuple(_channel(sensor, SENSORS[sensor], found) for sensor, found in rows.items() if found)
         if not channels:
             raise InputError(f"{path}: no sentence of a sensor behind a time (:TS); record :TS, :SA and :BI")

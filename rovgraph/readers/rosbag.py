@@ -177,10 +177,10 @@ class _Made:
                 telling[topic.name] = topic
         order = sorted(telling, key=lambda n: (_rank(telling[n]), -len(telling[n].rows[sensor])))
         for place, name in enumerate(preferred_first(self._path, sensor, order, self._choose)):
-            said = len(self.notes), len(self.warnings)
+            counts = len(self.notes), len(self.warnings)
             channel = self._channel(sensor, telling[name], place == 0)
             if place:  # unused ones get no warning
-                del self.notes[said[0] :], self.warnings[said[1] :]
+                del self.notes[counts[0] :], self.warnings[counts[1] :]
             yield channel
 
     def _channel(self, sensor: str, topic: Topic, first: bool) -> Channel:

@@ -59,8 +59,8 @@ class VectorNavSentences:
 
     def recognise(self, path: Path, head: bytes) -> float:
         lines = [line for line in head.splitlines()[:60] if line.strip()]
-        whole = sum(_sentence(line) is not None for line in lines)
-        return 0.9 if whole >= min(FEW, len(lines)) and 3 * whole >= len(lines) > 0 else 0.0
+        sentences = sum(_sentence(line) is not None for line in lines)
+        return 0.9 if sentences >= min(FEW, len(lines)) and 3 * sentences >= len(lines) > 0 else 0.0
 
     def read(self, path: Path, options: ReadingOptions) -> Recording:
         account, capture = Account(), _Capture()

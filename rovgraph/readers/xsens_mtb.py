@@ -189,8 +189,8 @@ def _numbers(identifier: int, data: NDArray[np.uint8]) -> Array | None:
 def _unix(time: NDArray[np.void]) -> Array:
     """Unix time of UTC items, shape (n,) [s]; NaN while the instrument has none."""
     known = (time["flags"] & UTC_VALID) == UTC_VALID
-    whole = unix_of_calendar(*(time[name].astype(np.int64) for name in CALENDAR))
-    return np.where(known, whole + 1e-9 * time["ns"], np.nan)
+    seconds = unix_of_calendar(*(time[name].astype(np.int64) for name in CALENDAR))
+    return np.where(known, seconds + 1e-9 * time["ns"], np.nan)
 
 
 def _table(values: dict[int, Array]) -> dict[str, Array]:

@@ -134,9 +134,9 @@ def compass_turn(field_n: Array, disturbance_n: Array) -> Array:
     field_n : ndarray, shape (3,), the Earth's field
     disturbance_n : ndarray, shape (n, 3), in the same unit
     """
-    whole = field_n + disturbance_n
-    across = field_n[0] * whole[:, 1] - field_n[1] * whole[:, 0]
-    return np.asarray(np.arctan2(across, whole[:, :2] @ field_n[:2]))
+    total = field_n + disturbance_n
+    across = field_n[0] * total[:, 1] - field_n[1] * total[:, 0]
+    return np.asarray(np.arctan2(across, total[:, :2] @ field_n[:2]))
 
 
 GRAVITY = 9.81

@@ -292,5 +292,5 @@ def _depth_noise(depth: Signal, config: Config, window: float) -> float:
     """Noise of a depth [m]: the configuration's, or what second differences show where that is more."""
     if np.median(np.diff(depth.time)) > window / 4.0:  # they would show the diving
         return config.depth.sd_m
-    shown = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
-    return float(max(config.depth.sd_m, shown))
+    noise = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
+    return float(max(config.depth.sd_m, noise))

@@ -124,8 +124,8 @@ def angles(log: Log, config: Config) -> Iterator[Finding]:
 def own(log: Log, config: Config) -> Iterator[Finding]:
     """What each sensor finds in its own values."""
     for sensor, stream in log.streams.items():
-        for said in SENSORS[sensor].look(stream.data, config):
-            yield Finding(sensor, *said)
+        for finding in SENSORS[sensor].look(stream.data, config):
+            yield Finding(sensor, *finding)
 
 
 def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:

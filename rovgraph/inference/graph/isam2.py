@@ -163,11 +163,11 @@ class Linearization:
         for k, (term, r, A_i, A_j, C) in enumerate(zip(terms, *self._motions(terms, x, c), strict=True)):
             r_i, H_i = nothing if term.before is None else term.before.linearize(x[k], c[k])
             r_j, H_j = nothing if term.here is None else term.here.linearize(x[k + 1], c[k])
-            here = MOTION + len(r_i)
-            J = np.zeros((here + len(r_j), MOTION + self._size))
+            end = MOTION + len(r_i)
+            J = np.zeros((end + len(r_j), MOTION + self._size))
             J[:MOTION, :MOTION], J[:MOTION, MOTION : 2 * MOTION], J[:MOTION, 2 * MOTION :] = A_i, A_j, C
-            J[MOTION:here, :MOTION], J[MOTION:here, 2 * MOTION :] = H_i[:, :MOTION], H_i[:, MOTION:]
-            J[here:, MOTION:] = H_j
+            J[MOTION:end, :MOTION], J[MOTION:end, 2 * MOTION :] = H_i[:, :MOTION], H_i[:, MOTION:]
+            J[end:, MOTION:] = H_j
             blocks = J[:, :MOTION], J[:, MOTION : 2 * MOTION], J[:, 2 * MOTION :]
             out.append(LinearInterval(*blocks, np.concatenate([r, r_i, r_j])))
         return out

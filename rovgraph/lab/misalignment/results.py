@@ -253,8 +253,8 @@ def study(
     InputError : of the engine, or a disk that is full
     """
     cells = plan.all_cells() if cells is None else cells
-    there = results.runs.read()
-    known = set(zip(there["cell"], there["run"], strict=True))
+    stored = results.runs.read()
+    known = set(zip(stored["cell"], stored["run"], strict=True))
     tasks = [CellTask(plan, cell, run) for run in range(plan.runs) for cell in cells if (cell.id, run) not in known]
     total, left = plan.runs * len(cells), len(tasks)
 

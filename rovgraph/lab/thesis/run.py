@@ -119,11 +119,11 @@ def timetable(samples: Sequence[Array], pings: Sequence[Array], longest: Sequenc
         k = np.arange(len(samples[b]))
         its_round = np.searchsorted(before, k)
         at = begins[its_round] + k - np.concatenate([[-1], before])[its_round] - 1
-        there = begins[1 : len(before) + 1] - 1
-        time[at, b], epoch[at, b], time[there, b], epoch[there, b] = samples[b], k, pings[b], before
-        number[there, b] = np.arange(len(before))
-        active[at, b] = active[there, b] = True
-        keeps_innovation[at[::KEEP_EVERY], b] = keeps_innovation[there, b] = True
+        at_ping = begins[1 : len(before) + 1] - 1
+        time[at, b], epoch[at, b], time[at_ping, b], epoch[at_ping, b] = samples[b], k, pings[b], before
+        number[at_ping, b] = np.arange(len(before))
+        active[at, b] = active[at_ping, b] = True
+        keeps_innovation[at[::KEEP_EVERY], b] = keeps_innovation[at_ping, b] = True
         steps = np.flatnonzero(active[:, b])
         keeps_state[steps, b] = _keeps(time[steps, b].tolist(), ping[steps].tolist(), longest[b])
     time, epoch = np.maximum.accumulate(time, axis=0), np.maximum.accumulate(epoch, axis=0)
@@ -212,15 +212,15 @@ class Recursion:
 
 def run_together(members: Sequence[Recursion]) -> None:
     """Filters of one kind (`Filter.kind`) over their whole logs; ``error`` says of each whether it diverged."""
-    whole = timetable(
+    table = timetable(
         [m.setup.log["imu"].time for m in members],
         [np.array([ping.time for ping in m.setup.pings]) for m in members],
         [m.setup.config.graph.max_gap_s for m in members],
     )
-    ends, under_way, step = whole.ends.tolist(), list(range(len(members))), 0
+    ends, under_way, step = table.ends.tolist(), list(range(len(members))), 0
     with np.errstate(over="ignore", invalid="ignore"):
         while under_way:
-            step = _Batch([members[b] for b in under_way]).run(whole.of(under_way), step)
+            step = _Batch([members[b] for b in under_way]).run(table.of(under_way), step)
             under_way = [b for b in under_way if ends[b] > step and members[b].error is None]
 
 
@@ -250,21 +250,21 @@ class _Batch:
 
     def run(self, table: Timetable, first: int) -> int:
         """Go on with step ``first`` until a member is through or diverges; the step to go on with then."""
-        whole = np.diff(table.time, axis=0, prepend=table.time[:1])
-        count = np.ceil(whole / LONGEST_STEP_S)  # of steps that forward Euler bears
-        parts, dt = count.max(axis=1).astype(int).tolist(), whole / np.maximum(count, 1.0)
+        intervals = np.diff(table.time, axis=0, prepend=table.time[:1])
+        count = np.ceil(intervals / LONGEST_STEP_S)  # of steps that forward Euler bears
+        parts, dt = count.max(axis=1).astype(int).tolist(), intervals / np.maximum(count, 1.0)
         keeps_innovation, keeps_state = (np.any(keeps, axis=1) for keeps in (table.keeps_innovation, table.keeps_state))
         for step in range(first, int(table.ends.min())):
             for part in range(parts[step]):
                 self._predict(dt[step] * (part < count[step]))
             self._time, self._epoch = table.time[step], table.epoch[step]
-            taken: UpdateResult | None = None
+            update: UpdateResult | None = None
             if table.ping[step]:
-                taken = self._take_ping(table.number[step], table.active[step])
+                update = self._take_ping(table.number[step], table.active[step])
             elif self._imu is not None:
-                taken = self._take_sample(self._imu, table.active[step])
-            if taken is not None and keeps_innovation[step]:
-                self._keep_innovations(taken, table, step)
+                update = self._take_sample(self._imu, table.active[step])
+            if update is not None and keeps_innovation[step]:
+                self._keep_innovations(update, table, step)
             if keeps_state[step]:
                 self._keep_states(table.keeps_state[step])
             if self._diverged():

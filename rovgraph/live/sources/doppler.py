@@ -63,12 +63,12 @@ def tracker(url: str, notify: Notify) -> LineDecoder:
     """Decoder of a Tracker 650's sentences, stamped by the time since it was switched on."""
 
     def parse(line: bytes, arrival: float) -> Message | None:
-        said = cerulean.ping(line)
-        if said is None:
+        report = cerulean.ping(line)
+        if report is None:
             if cerulean.SENTENCE.search(line) is None:
                 raise Refused("malformed", f"expected a sentence of a Tracker 650, got {shown(line)}; it is skipped")
             return None
-        return Message(url, arrival, said[0], readings(said[1]))
+        return Message(url, arrival, report[0], readings(report[1]))
 
     return LineDecoder(parse, notify)
 
@@ -90,9 +90,9 @@ class NucleusDecoder:
         self._rest = content[cut:]
         if found.skipped > len(content) - found.cut:
             self._notify("malformed", "bytes that are no whole record with right checksums are skipped")
-        said = {kind: nucleus.said_of(content, found, kind) for kind in nucleus.KINDS}
+        records = {kind: nucleus.said_of(content, found, kind) for kind in nucleus.KINDS}
         for clock, unix in (("boot", 0), ("unix", 1)):
-            of_clock = {kind: each.only(each.common["flags"] & 1 == unix) for kind, each in said.items()}
+            of_clock = {kind: each.only(each.common["flags"] & 1 == unix) for kind, each in records.items()}
             yield from _messages(nucleus.channels_of(of_clock, clock), self._url, chunk.arrival, clock)
 
 

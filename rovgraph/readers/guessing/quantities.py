@@ -158,9 +158,9 @@ def _angles(group: Group, yaw: str, time: Array, gyro: _Gyro, out: Guesses) -> _
         unit = UnitGuess(pairs[0][0], "turns as the gyro does", "sure")
         left = tuple(dict.fromkeys(rate for _, rate in pairs))
     if correlation < 0.0:
-        said = group.columns[yaw].meaning.enu
-        unit = replace(unit, why=f"{unit.why}; {ANTICLOCKWISE}", sureness=unit.sureness if said else "unsure")
-        if said:
+        stated = group.columns[yaw].meaning.enu
+        unit = replace(unit, why=f"{unit.why}; {ANTICLOCKWISE}", sureness=unit.sureness if stated else "unsure")
+        if stated:
             out.state("angles", _named(group, yaw), "enu")
     propose(out, group, unit)
     return replace(gyro, units=left, heading=True)

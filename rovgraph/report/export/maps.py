@@ -96,20 +96,20 @@ def document(track: Track, options: ExportOptions) -> "simplekml.Kml":
     import simplekml
 
     kml = simplekml.Kml(name=f"{track.name}, {track.estimate}")
-    shown = track.at_rate(options.rate_or(SHOWN_HZ))
-    lat, lon = shown.lat_lon
+    sampled = track.at_rate(options.rate_or(SHOWN_HZ))
+    lat, lon = sampled.lat_lon
     lon = track.continuous(lon)
-    height = np.nan_to_num(shown.height)
+    height = np.nan_to_num(sampled.height)
     coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()
     if track.has_utc:
         line = kml.newgxtrack(name=track.name, altitudemode="absolute")
-        line.newwhen([stamp.strftime("%Y-%m-%dT%H:%M:%S.%fZ") for stamp in shown.utc])
+        line.newwhen([stamp.strftime("%Y-%m-%dT%H:%M:%S.%fZ") for stamp in sampled.utc])
         line.newgxcoord(coordinates)
-        line.newgxangle([(float(yaw), 0.0, 0.0) for yaw in np.rad2deg(shown.trajectory.rpy[:, 2]).round(3) % 360.0])
+        line.newgxangle([(float(yaw), 0.0, 0.0) for yaw in np.rad2deg(sampled.trajectory.rpy[:, 2]).round(3) % 360.0])
     else:
         line = kml.newlinestring(name=track.name, altitudemode="absolute", coords=coordinates)
     line.style.linestyle.color, line.style.linestyle.width = LINE, 3
-    _add_ellipses(kml, shown)
+    _add_ellipses(kml, sampled)
     _add_fixes(kml, track)
     return kml
 
@@ -158,13 +158,13 @@ def write_gpx(track: Track, path: Path, options: ExportOptions) -> None:
     """A track; with time where that is known."""
     import gpxpy.gpx
 
-    shown = track.at_rate(options.rate_or(SHOWN_HZ))
+    sampled = track.at_rate(options.rate_or(SHOWN_HZ))
     gpx = gpxpy.gpx.GPX()
     gpx.creator = "rovgraph"
     line = gpxpy.gpx.GPXTrack(name=f"{track.name}, {track.estimate}")
     segment = gpxpy.gpx.GPXTrackSegment()
-    times = shown.utc.to_pydatetime() if shown.has_utc else [None] * len(shown.trajectory)
-    for lat, lon, high, time in zip(*shown.lat_lon, shown.height, times, strict=True):
+    times = sampled.utc.to_pydatetime() if sampled.has_utc else [None] * len(sampled.trajectory)
+    for lat, lon, high, time in zip(*sampled.lat_lon, sampled.height, times, strict=True):
         height = None if high != high else round(float(high), 4)
         segment.points.append(gpxpy.gpx.GPXTrackPoint(round(float(lat), 9), round(float(lon), 9), height, time))
     line.segments.append(segment)
@@ -192,10 +192,10 @@ def write_layer(track: Track, path: Path, options: ExportOptions, driver: str) -
     import pyogrio.raw
     import shapely
 
-    shown = track.at_rate(options.rate_or(SHOWN_HZ))
-    table = point_table(shown)
+    sampled = track.at_rate(options.rate_or(SHOWN_HZ))
+    table = point_table(sampled)
     x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
-    points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(shown.height)])))
+    points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(sampled.height)])))
     fields = [name[:LONGEST] if driver == "ESRI Shapefile" else name for name in table.columns]
     try:
         pyogrio.raw.write(

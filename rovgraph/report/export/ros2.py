@@ -41,8 +41,8 @@ def write_bag(track: Track, path: Path, options: ExportOptions, plugin: str) -> 
             "to add as --unix-offset"
         )
     store = get_typestore(Stores.ROS2_HUMBLE)
-    shown = track.at_rate(options.rate)
-    messages = RosMessages(store, shown)
+    sampled = track.at_rate(options.rate)
+    messages = RosMessages(store, sampled)
     topics = {
         "/odometry": ("nav_msgs/msg/Odometry", messages.odometry),
         "/tf": ("tf2_msgs/msg/TFMessage", messages.transform),
@@ -52,7 +52,7 @@ def write_bag(track: Track, path: Path, options: ExportOptions, plugin: str) -> 
     with Writer(path, version=9, storage_plugin=StoragePlugin[plugin]) as bag:
         lines = {topic: bag.add_connection(topic, name, typestore=store) for topic, (name, _) in topics.items()}
         whole = bag.add_connection("/path", "nav_msgs/msg/Path", typestore=store)
-        stamps = np.round(shown.trajectory.time * 1e9).astype(np.int64).tolist()
+        stamps = np.round(sampled.trajectory.time * 1e9).astype(np.int64).tolist()
         bag.write(whole, stamps[0], store.serialize_cdr(messages.path(), "nav_msgs/msg/Path"))
         for k, stamp in enumerate(stamps):
             for topic, (name, make) in topics.items():

@@ -222,11 +222,11 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
     if not isinstance(summary, dict) or summary.get("program") != "rovgraph":
         raise InputError(f"{folder}/summary.json: is not of rovgraph, expected a results folder of it")
     compatibility.refuse_newer(summary.get("format"), compatibility.RESULTS, f"{folder}: results folder")
-    there = [kind for kind in ESTIMATES if (folder / f"trajectory_{kind}.csv").is_file()]
-    if not there or estimate not in (None, *there):
-        found = ", ".join(there) or "no trajectory"
+    kinds = [kind for kind in ESTIMATES if (folder / f"trajectory_{kind}.csv").is_file()]
+    if not kinds or estimate not in (None, *kinds):
+        found = ", ".join(kinds) or "no trajectory"
         raise InputError(f"{folder}: the {estimate or 'smoothed'} estimate is not in it; there is {found}")
-    chosen = there[0] if estimate is None else estimate
+    chosen = kinds[0] if estimate is None else estimate
     place = summary.get("origin")
     origin = None if place is None else (float(place["lat_deg"]), float(place["lon_deg"]))
     trajectory = read_trajectory(folder / f"trajectory_{chosen}.csv")

@@ -65,12 +65,12 @@ def write_sbet(track: Track, path: Path, options: ExportOptions) -> None:
     ------
     InputError : no origin, no Unix time
     """
-    shown = track.at_rate(options.rate_or(RATE))
-    t = shown.trajectory
-    lat, lon = shown.lat_lon
+    sampled = track.at_rate(options.rate_or(RATE))
+    t = sampled.trajectory
+    lat, lon = sampled.lat_lon
     record = np.zeros((len(t), len(NAMES)), dtype="<f8")
     record[:, 0] = week_seconds(t.time)
-    record[:, 1:4] = np.column_stack([np.deg2rad(lat), np.deg2rad(lon), shown.height])
+    record[:, 1:4] = np.column_stack([np.deg2rad(lat), np.deg2rad(lon), sampled.height])
     record[:, 4:7], record[:, 7:10] = t.v_n, t.rpy
     path.mkdir()
     (path / "sbet.out").write_bytes(record.tobytes())
@@ -93,15 +93,15 @@ def write_netcdf(track: Track, path: Path, options: ExportOptions) -> None:
     """Every keyframe, or at a rate. Latitude and longitude are there where they are known."""
     import xarray as xr
 
-    shown = track.at_rate(options.rate)
-    t = shown.trajectory
+    sampled = track.at_rate(options.rate)
+    t = sampled.trajectory
     variables: dict[str, tuple[str, np.ndarray, dict[str, str]]] = {
         "depth": ("time", t.p_n[:, 2], {"standard_name": "depth", "units": "m", "positive": "down", "axis": "Z"}),
         "north": ("time", t.p_n[:, 0], {"long_name": "north of the origin", "units": "m"}),
         "east": ("time", t.p_n[:, 1], {"long_name": "east of the origin", "units": "m"}),
     }
     if track.origin is not None:
-        for name, degrees, axis in zip(("latitude", "longitude"), shown.lat_lon, ("north", "east"), strict=True):
+        for name, degrees, axis in zip(("latitude", "longitude"), sampled.lat_lon, ("north", "east"), strict=True):
             variables[name] = ("time", degrees, {"standard_name": name, "units": f"degrees_{axis}"})
     for k, (name, standard) in enumerate(ANGLES.items()):
         variables[name] = ("time", np.rad2deg(t.rpy[:, k]), {"standard_name": standard, "units": "degree"})
