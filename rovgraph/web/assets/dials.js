@@ -10,9 +10,9 @@ const POINTS = { 0: "N", 90: "E", 180: "S", 270: "W" };
 // The card turns below a fixed mark, what is ahead is up. The wedge is one sd to either side, the blue arrow points home.
 export function rose(canvas, yaw, sd, home) {
   const [c, width, height] = blank(canvas);
-  const r = Math.min(width, height) / 2 - 12;
+  const r = Math.min(width, height) / 2 - 14;
   if (r <= 20) return;
-  c.translate(width / 2, height / 2 + 4);
+  c.translate(width / 2, height / 2 + 5);
   c.textAlign = "center";
   c.textBaseline = "middle";
   const along = (angle, radius) => [radius * Math.sin(angle), -radius * Math.cos(angle)];
@@ -20,7 +20,7 @@ export function rose(canvas, yaw, sd, home) {
     const half = Math.min(Math.PI, Math.max(sd, 0.5 * DEG));
     c.beginPath();
     c.arc(0, 0, r, -Math.PI / 2 - half, -Math.PI / 2 + half);
-    c.arc(0, 0, 0.62 * r, -Math.PI / 2 + half, -Math.PI / 2 - half, true);
+    c.arc(0, 0, r - 32, -Math.PI / 2 + half, -Math.PI / 2 - half, true);
     c.closePath();
     c.globalAlpha = 0.3;
     c.fillStyle = palette.sure;
@@ -44,7 +44,7 @@ export function rose(canvas, yaw, sd, home) {
     if (!letter && !(long && r > 80)) continue;
     c.font = letter ? "700 18px system-ui, sans-serif" : "12px system-ui, sans-serif";
     c.fillStyle = letter === "N" ? palette.bad : palette.ink;
-    c.fillText(letter ?? `${degrees}`, ...along(angle, r - 22));
+    c.fillText(letter ?? `${degrees}`, ...along(angle, r - 21));
   }
   arrow(c, palette.ink, [[0, -r + 1], [9, -r - 14], [-9, -r - 14]]);
   if (home === null) return;

@@ -14,7 +14,7 @@ export function element(name, text = "", className = "") {
   return made;
 }
 
-export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0));
+export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0).replace("-", "−"));
 const spread = (v) => (v === null ? "–" : v < 100 ? `${+v.toPrecision(2)}` : v.toFixed(0));
 export const bearing = (radians) => `${(Math.round(radians * DEG + 360) % 360).toString().padStart(3, "0")}°`;
 
@@ -35,9 +35,9 @@ export function elapsed(s) {
 }
 
 const VERDICTS = {
-  trusted: ["good", "nothing contradicts the estimate"],
-  doubtful: ["warn", "the position may be wrong"],
-  wrong: ["bad", "do not use the position"],
+  trusted: ["good", "no alarm"],
+  doubtful: ["warn", "may be wrong"],
+  wrong: ["bad", "do not use it"],
 };
 
 export class Gauges {

@@ -161,6 +161,7 @@ export class LiveMap {
     c.lineWidth = 3;
     c.lineJoin = "round";
     this.track.draw(c, (n, e) => this.toScreen(n, e));
+    if (this.track.length) this.drawHome();
     for (const mark of this.state?.marks ?? []) this.drawMark(mark);
     if (this.state) this.drawVehicle(this.state);
     this.drawNumbers();
@@ -198,7 +199,7 @@ export class LiveMap {
 
   // Lines of the grid: axis (0 = of one north), where on it, and their ends on the edges of the screen.
   gridLines() {
-    const step = niceStep(90 / this.scale);
+    const step = niceStep((this.width < 600 ? 60 : 90) / this.scale);
     const reach = Math.hypot(this.width, this.height) / 2 / this.scale;
     const lines = [];
     for (const axis of [0, 1]) {
@@ -240,6 +241,19 @@ export class LiveMap {
     for (const [px, py] of [[0, -6], [0, 0], [step * this.scale, 0], [step * this.scale, -6]]) c.lineTo(x + px, y + py);
     c.stroke();
     this.drawText(`${+step.toPrecision(2)} m`, x, y - 6, palette.ink);
+  }
+
+  drawHome() {
+    const c = this.context;
+    const [x, y] = this.toScreen(this.track.north[0], this.track.east[0]);
+    c.beginPath();
+    for (const [px, py] of [[0, -11], [10, -2], [7, -2], [7, 8], [-7, 8], [-7, -2], [-10, -2]]) c.lineTo(x + px, y + py);
+    c.closePath();
+    c.fillStyle = palette.sure;
+    c.fill();
+    c.strokeStyle = palette.paper;
+    c.lineWidth = 2;
+    c.stroke();
   }
 
   drawMark(mark) {

@@ -21,7 +21,7 @@ let state = null;
 let chartsPlaced = false;
 
 const look = new Look((dark) => {
-  at("look").textContent = dark ? "Daylight" : "Dark";
+  at("look").textContent = dark ? "Day" : "Dark";
   if (state) showNumbers();
   map.changed();
 });
@@ -85,7 +85,7 @@ function showState(news) {
 function showNumbers() {
   gauges.show(state, map.track);
   const { longer, shorter } = ellipse(state);
-  at("ellipse-legend").textContent = `95 % ellipse${longer >= 0 ? `, ${metres(longer)} × ${metres(shorter)} m to each side` : ""}`;
+  at("ellipse-legend").textContent = `ellipse: 95 %${longer >= 0 ? `, half axes ${metres(longer)} × ${metres(shorter)} m` : ""}`;
 }
 
 // The gravest first. What an alarm is about stays the same while the numbers in its text change.
@@ -287,7 +287,7 @@ at("sd-legend").append(...palette.sd.map((_, k) => {
   const row = element("span", last ? "more" : `${colourEnd(k)}`);
   row.style.borderBottomColor = `var(--sd-${k})`;
   return row;
-}), " m");
+}));
 
 function showClock() {
   at("wall-clock").textContent = new Date().toTimeString().slice(0, 8);

@@ -75,7 +75,7 @@ export class Siren {
   }
 
   show() {
-    this.button.textContent = this.muted ? "Sound off" : this.ready ? "Sound on" : "Tap for sound";
+    this.button.textContent = this.muted ? "Sound off" : this.ready ? "Sound on" : "Sound: tap";
     this.button.setAttribute("aria-pressed", `${!this.muted && this.ready}`);
     this.button.classList.toggle("warn", this.muted || !this.ready);
   }
