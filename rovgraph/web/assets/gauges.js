@@ -15,7 +15,7 @@ export function element(name, text = "", className = "") {
 }
 
 export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0).replace("-", "−"));
-const spread = (v) => (v === null ? "–" : v < 100 ? `${+v.toPrecision(2)}` : v.toFixed(0));
+const spread = (v) => (v === null ? "–" : v < 100 ? `${+(+v.toPrecision(2)).toFixed(3)}` : v.toFixed(0));
 export const bearing = (radians) => `${(Math.round(radians * DEG + 360) % 360).toString().padStart(3, "0")}°`;
 
 export function duration(s) {
@@ -67,7 +67,7 @@ export class Gauges {
     rose(heading.lastChild, s.yaw, s.yaw_sd, away ? home : null);
     this.gauge("gauges", "home", `${metres(far)} m\n${away ? bearing(home) : "–"}`, this.resumed ? "to where it resumed" : "home, to the start");
     this.gauge("gauges", "speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, `speed, ${s.speed === null ? "–" : (s.speed / KNOT).toFixed(1)} kn`);
-    this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
+    if (s.altitude !== null || this.gauges.has("altitude")) this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
     const depth = this.gauge("gauges", "depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m`, "", true);
     depthCurve(depth.lastChild, track, s.time, s.down);
     this.gauge("gauges", "north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);

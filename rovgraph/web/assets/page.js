@@ -92,9 +92,10 @@ function showNumbers() {
 function showAlarms(news, old) {
   const all = [
     ...news.limits.map((a) => ["wrong", a.text, `${a.kind} ${a.text.replace(/[\d.]+/g, "")}`]),
-    ...news.alarms.map((a) => [a.severity, `${a.sensor}: ${a.kind}: ${a.text}`, `${a.sensor} ${a.kind} ${a.severity}`]),
+    ...news.alarms.map((a) => [a.severity, `${a.text.startsWith(`${a.sensor}:`) ? "" : `${a.sensor}: `}${a.text}`, `${a.sensor} ${a.kind} ${a.severity}`]),
   ].sort((a, b) => (b[0] === "wrong") - (a[0] === "wrong"));
-  siren.tell([...all.map(([severity, , name]) => [name, severity]), ...(old ? [["old", "wrong"]] : [])]);
+  const red = [...(old ? ["old"] : []), ...(news.lock_lost_s > 0 ? ["lock"] : [])].map((name) => [name, "wrong"]);
+  siren.tell([...all.map(([severity, , name]) => [name, severity]), ...red]);
   const lines = all.slice(0, SHOWN_ALARMS);
   if (all.length > SHOWN_ALARMS) lines.push(["more", `and ${all.length - SHOWN_ALARMS} more, see the events`]);
   const shown = at("alarms").children;
