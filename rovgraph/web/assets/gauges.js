@@ -35,7 +35,7 @@ export function elapsed(s) {
 }
 
 const VERDICTS = {
-  trusted: ["good", "no alarm"],
+  trusted: ["good", "sensors agree"],
   doubtful: ["warn", "may be wrong"],
   wrong: ["bad", "do not use it"],
 };

@@ -231,8 +231,8 @@ export class LiveMap {
     for (const [axis, value, ends] of lines) {
       const [x, y] = ends.sort((p, q) => (axis ? q[1] - p[1] : p[0] - q[0]))[0];
       const text = value === 0 ? "0" : `${+Math.abs(value).toPrecision(6)} ${(axis ? "WE" : "SN")[+(value > 0)]}`;
-      if (axis ? x < 44 : y > this.height - 36) continue; // the corner belongs to one of both
-      this.drawText(text, Math.min(x, this.width - 60), Math.max(18, Math.min(y, this.height - 4)), palette.soft);
+      if (axis ? x < 44 || x > this.width - 56 : y < 16 || y > this.height - 36) continue; // in a corner, or cut off
+      this.drawText(text, x, y - (axis ? 4 : 0), palette.soft);
     }
     const [x, y] = [this.width - 12 - step * this.scale, this.height - 34];
     c.strokeStyle = palette.ink;
