@@ -339,7 +339,9 @@ def test_every_element_that_the_scripts_ask_for_is_on_the_page_and_every_import_
         wanted += re.findall(r'this\.gauge\("(\w+)"', text)
         assert set(wanted) <= set(known), script.name
         for names, module in re.findall(r'^import \{([^}]*)\} from "\./([^"]+)";', text, re.MULTILINE):
-            exported = re.findall(r"^export (?:async )?(?:const|class|function) (\w+)", (ASSETS / module).read_text(), re.M)
+            exported = re.findall(
+                r"^export (?:async )?(?:const|class|function) (\w+)", (ASSETS / module).read_text(), re.M
+            )
             assert {name.strip() for name in names.split(",")} <= set(exported), f"{script.name}: {module}"
 
 
@@ -362,9 +364,15 @@ def test_text_and_track_stand_out_in_both_looks(look):
     colours = dict(re.findall(r"--([\w-]+): (#\w+);", daylight if look == "daylight" else dark))
     texts = [(ink, paper) for ink in ("ink", "soft", "good", "warn", "bad") for paper in ("paper", "sea")]
     texts += [("on-fill", "good-fill"), ("on-fill", "bad-fill"), ("on-warn", "warn-fill"), ("paper", "sure")]
-    assert {pair: contrast(*(colours[name] for name in pair)) for pair in texts if contrast(*(colours[n] for n in pair)) < 4.5} == {}
+    assert {
+        pair: contrast(*(colours[name] for name in pair))
+        for pair in texts
+        if contrast(*(colours[n] for n in pair)) < 4.5
+    } == {}
     lines = [f"sd-{k}" for k in range(8)] + ["sure", "line"]
-    assert {name: contrast(colours[name], colours["sea"]) for name in lines if contrast(colours[name], colours["sea"]) < 3} == {}
+    assert {
+        name: contrast(colours[name], colours["sea"]) for name in lines if contrast(colours[name], colours["sea"]) < 3
+    } == {}
 
 
 @pytest.mark.parametrize(

@@ -59,11 +59,14 @@ def test_the_page_shows_the_dive_and_runs_nobodys_text(browser, dive, width):
     assert min(sizes) >= 48
     assert "no lock" in page.inner_text("#status") and "trusted" in page.inner_text("#status")
     assert not page.is_visible("#learnt")
-    assert page.evaluate("""() => {
+    assert (
+        page.evaluate("""() => {
         const map = document.getElementById("map-frame").getBoundingClientRect();
         return [...document.querySelectorAll("button, #legend, #alarms")].map((one) => one.getBoundingClientRect())
             .filter((box) => box.width && box.bottom > map.top && box.top < map.bottom && box.left < map.right && box.right > map.left).length;
-    }""") == 0
+    }""")
+        == 0
+    )
     assert errors == []
 
 

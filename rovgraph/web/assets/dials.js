@@ -93,7 +93,7 @@ export function depthCurve(canvas, track, now, down) {
     c.lineTo(width, y(k * step));
     c.fillText(`${+(k * step).toPrecision(4)}`, left - 5, y(k * step));
   }
-  for (let minute = 0; minute <= 10; minute += 5) {
+  for (const minute of width < 240 ? [0, 10] : [0, 5, 10]) {
     c.moveTo(x(now - 60 * minute), 0);
     c.lineTo(x(now - 60 * minute), bottom);
     c.textAlign = minute === 0 ? "right" : minute === 10 ? "left" : "center";

@@ -224,15 +224,16 @@ export class LiveMap {
     c.stroke();
   }
 
-  // Of lines of one north at their left end, of one east at their lower end; and the length of a step.
+  // What a line's place is, where it meets the left or the lower edge; and the length of a step.
   drawNumbers() {
     const c = this.context;
     const [step, lines] = this.gridLines();
     for (const [axis, value, ends] of lines) {
-      const [x, y] = ends.sort((p, q) => (axis ? q[1] - p[1] : p[0] - q[0]))[0];
+      const left = ends.find((end) => end[0] < 1);
+      const end = left ?? ends.find((one) => one[1] > this.height - 1);
+      if (!end || (left ? end[1] < 16 || end[1] > this.height - 36 : end[0] < 44 || end[0] > this.width - 56)) continue;
       const text = value === 0 ? "0" : `${+Math.abs(value).toPrecision(6)} ${(axis ? "WE" : "SN")[+(value > 0)]}`;
-      if (axis ? x < 44 || x > this.width - 56 : y < 16 || y > this.height - 36) continue; // in a corner, or cut off
-      this.drawText(text, x, y - (axis ? 4 : 0), palette.soft);
+      this.drawText(text, end[0], end[1] - (left ? 0 : 4), palette.soft);
     }
     const [x, y] = [this.width - 12 - step * this.scale, this.height - 34];
     c.strokeStyle = palette.ink;
