@@ -232,7 +232,7 @@ export class LiveMap {
       const left = ends.find((end) => end[0] < 1);
       const end = left ?? ends.find((one) => one[1] > this.height - 1);
       if (!end || (left ? end[1] < 16 || end[1] > this.height - 36 : end[0] < 44 || end[0] > this.width - 56)) continue;
-      const text = value === 0 ? "0" : `${+Math.abs(value).toPrecision(6)} ${(axis ? "WE" : "SN")[+(value > 0)]}`;
+      const text = `${+Math.abs(value).toPrecision(6)} ${(axis ? "WE" : "SN")[+(value >= 0)]}`;
       this.drawText(text, end[0], end[1] - (left ? 0 : 4), palette.soft);
     }
     const [x, y] = [this.width - 12 - step * this.scale, this.height - 34];
