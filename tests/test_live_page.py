@@ -35,6 +35,7 @@ from rovgraph.web.view import PIECE, LiveTrack, PageLimits, View
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & δύτης 潜水"
 TOKEN = "a-token-of-24-characters"
+ASSETS = Path(broadcasting.__file__).parent / "assets"
 HERE = {"host": "127.0.0.1:8080"}
 OWN = {**HERE, "origin": "http://127.0.0.1:8080"}
 
@@ -325,8 +326,47 @@ def test_every_answer_forbids_foreign_code_and_foreign_frames():
         assert "unsafe" not in policy
     page = server.client.get("/").text
     assert not re.search(r"<script(?![^>]*src=)|\son\w+=|\sstyle=", page)
-    assets = Path(broadcasting.__file__).parent / "assets"
-    assert not any(re.search(r"innerHTML|\beval\(|new Function|https?://", f.read_text()) for f in assets.glob("*.js"))
+    assert not any(re.search(r"innerHTML|\beval\(|new Function|https?://", f.read_text()) for f in ASSETS.glob("*.js"))
+
+
+def test_every_element_that_the_scripts_ask_for_is_on_the_page_and_every_import_is_there():
+    html = (ASSETS / "index.html").read_text()
+    known = re.findall(r'\bid="([^"]+)"', html)
+    assert len(known) == len(set(known))
+    for script in ASSETS.glob("*.js"):
+        text = script.read_text()
+        wanted = re.findall(r'(?:\bat|getElementById|asked)\("([^"]+)"\)', text)
+        wanted += re.findall(r'this\.gauge\("(\w+)"', text)
+        assert set(wanted) <= set(known), script.name
+        for names, module in re.findall(r'^import \{([^}]*)\} from "\./([^"]+)";', text, re.MULTILINE):
+            exported = re.findall(
+                r"^export (?:async )?(?:const|class|function) (\w+)", (ASSETS / module).read_text(), re.M
+            )
+            assert {name.strip() for name in names.split(",")} <= set(exported), f"{script.name}: {module}"
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of #rgb or #rrggbb, as WCAG 2.2 defines it."""
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * one for one in colour[1:])
+    parts = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+    linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: str, other: str) -> float:
+    dark, light = sorted((luminance(one), luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("look", ["daylight", "dark"])
+def test_text_and_track_stand_out_in_both_looks(look):
+    daylight, dark = re.findall(r":root\S* \{(.*?)\}", (ASSETS / "page.css").read_text(), re.DOTALL)
+    colours = dict(re.findall(r"--([\w-]+): (#\w+);", daylight if look == "daylight" else dark))
+    texts = [(ink, paper) for ink in ("ink", "soft", "good", "warn", "bad") for paper in ("paper", "sea")]
+    texts += [("on-fill", "good-fill"), ("on-fill", "bad-fill"), ("on-warn", "warn-fill"), ("paper", "sure")]
+    lines = [(line, "sea") for line in (*(f"sd-{k}" for k in range(8)), "sure", "line")]
+    for pairs, least in ((texts, 4.5), (lines, 3.0)):
+        assert [pair for pair in pairs if contrast(colours[pair[0]], colours[pair[1]]) < least] == []
 
 
 @pytest.mark.parametrize(

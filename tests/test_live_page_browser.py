@@ -15,6 +15,12 @@ from rovgraph.web.view import STEP_M
 WIDTHS = (400, 1600)
 SLOWEST_MS = 100.0
 HOUR = 12_000  # points of an hour at a third of a metre a second
+OVER_THE_MAP = """() => {
+    const map = document.getElementById("map-frame").getBoundingClientRect();
+    const over = (box) => box.bottom > map.top && box.top < map.bottom && box.left < map.right && box.right > map.left;
+    const all = [...document.querySelectorAll("button, #legend, #alarms")];
+    return all.filter((one) => over(one.getBoundingClientRect())).map((one) => one.id);
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +40,7 @@ def dive():
 
 def opened(browser, dive, width):
     """The page once it is live, and what it complained of."""
-    page = browser.new_context(viewport={"width": width, "height": 800}).new_page()
+    page = browser.new_context(viewport={"width": width, "height": 800}, color_scheme="light").new_page()
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -57,6 +63,48 @@ def test_the_page_shows_the_dive_and_runs_nobodys_text(browser, dive, width):
     assert "dvl_yaw 44.12 ± 0.57 °" in page.text_content("#learnt")
     sizes = page.evaluate("[...document.querySelectorAll('#tools button')].map(b => b.getBoundingClientRect().height)")
     assert min(sizes) >= 48
+    assert "no lock" in page.inner_text("#status") and "trusted" in page.inner_text("#status")
+    assert not page.is_visible("#learnt")
+    assert page.evaluate(OVER_THE_MAP) == []
+    assert errors == []
+
+
+def test_home_depth_and_heading_of_a_dive(browser, dive):
+    for k in range(200):
+        dive[0].send(solution(5.0 * k, 0.5 * k, position=np.array([0.5 * k, 2.0 + 0.5 * k, 3.0 + 0.01 * k])))
+    page, errors = opened(browser, dive, 1600)
+    page.wait_for_function("rovgraph.map.state.time === 995")
+    home = page.inner_text(".gauge.home")
+    assert "140.7 m" in home and "225°" in home
+    assert "0:16:35" in page.inner_text("#times")
+    assert page.evaluate("rovgraph.map.track.since(995 - 600).length") == 121
+    assert errors == []
+
+
+def test_colours_and_sound_are_chosen_and_remembered(browser, dive):
+    dive[0].send(solution(1.0))
+    page, errors = opened(browser, dive, 1600)
+    assert page.evaluate("document.documentElement.dataset.look") == "daylight"
+    page.click("#look")
+    page.click("#sound")
+    page.wait_for_function("document.getElementById('sound').textContent === 'Sound on'")
+    dive[0].send(solution(2.0, position_sd=np.full(3, 9.0)))
+    page.wait_for_function("rovgraph.siren.played >= 2")  # the sound of the button, and the alarm
+    page.click("#sound")
+    page.reload()
+    page.wait_for_selector("#gauges b")
+    assert page.evaluate("document.documentElement.dataset.look") == "dark"
+    assert page.inner_text("#sound") == "Sound off"
+    assert errors == []
+
+
+def test_no_sound_is_made_before_the_page_is_touched(browser, dive):
+    dive[0].send(solution(1.0, position_sd=np.full(3, 9.0)))
+    page, errors = opened(browser, dive, 1600)
+    assert page.inner_text("#sound") == "Sound: tap"
+    assert page.evaluate("[rovgraph.siren.played, rovgraph.siren.context]") == [0, None]
+    page.keyboard.press("x")
+    page.wait_for_function("rovgraph.siren.played === 1", timeout=20_000)  # repeated while it lasts
     assert errors == []
 
 

@@ -70,6 +70,6 @@ def test_the_live_page_shows_track_and_sensors(browser, pictures, log, config):
         page = browser.new_context(viewport=LIVE).new_page()
         page.goto(server.url)
         page.wait_for_selector("#gauges b", timeout=60_000)
-        page.click("text=All")
+        page.click("#fit")
         server.send(next(solutions))  # or the page would say how long there was none
         take(page, pictures / "live-page.png")

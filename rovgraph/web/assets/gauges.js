@@ -1,6 +1,10 @@
 // Numbers beside the map. Text reaches the page as text only.
 
+import { depthCurve, learntCurve, rose } from "./dials.js";
+
 const DEG = 180 / Math.PI;
+const KNOT = 1852 / 3600; // [m/s]
+const AT_HOME_M = 1; // nearer than that its bearing says nothing
 const HISTORY = 240; // values of a small curve
 
 export function element(name, text = "", className = "") {
@@ -10,8 +14,8 @@ export function element(name, text = "", className = "") {
   return made;
 }
 
-export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0));
-const spread = (v) => (v === null ? "–" : v < 100 ? `${+v.toPrecision(2)}` : v.toFixed(0));
+export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0).replace("-", "−"));
+const spread = (v) => (v === null ? "–" : v < 100 ? `${+(+v.toPrecision(2)).toFixed(3)}` : v.toFixed(0));
 export const bearing = (radians) => `${(Math.round(radians * DEG + 360) % 360).toString().padStart(3, "0")}°`;
 
 export function duration(s) {
@@ -25,45 +29,76 @@ export function clock(time) {
   return time > 1e9 ? `${new Date(1000 * time).toISOString().slice(11, 19)} UTC` : `${time.toFixed(1)} s`;
 }
 
+export function elapsed(s) {
+  const [whole, two] = [Math.max(0, Math.floor(s)), (n) => `${n}`.padStart(2, "0")];
+  return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
+}
+
+const VERDICTS = {
+  trusted: ["good", "sensors agree"],
+  doubtful: ["warn", "may be wrong"],
+  wrong: ["bad", "do not use it"],
+};
+
 export class Gauges {
   constructor() {
     this.gauges = new Map();
     this.rows = new Map();
     this.curves = new Map();
     this.units = {}; // calibration variable -> factor to what is shown, and its unit
+    this.resumed = false; // the track begins where a run before it ended
   }
 
-  show(s) {
+  show(s, track) {
     const kinds = new Set(s.limits.map((one) => one.kind));
-    const heading = ((s.yaw * DEG) % 360 + 360) % 360;
-    this.gauge("heading", `${heading.toFixed(1)}°`, `heading, sd ${s.yaw_sd === null ? "–" : spread(s.yaw_sd * DEG)}°`, kinds.has("heading"));
-    this.gauge("depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m`);
-    this.gauge("altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
-    this.gauge("speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, "speed");
-    this.gauge("sd", `${metres(s.ellipse_sd)} m`, "position sd", kinds.has("position"));
-    const lost = s.lock_lost_s > 0;
-    const lock = s.lock_lost_s === null ? "–" : lost ? duration(s.lock_lost_s) : "locked";
-    this.gauge("lock", lock, lost ? "since bottom lock" : "bottom lock", lost);
-    this.gauge("north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);
-    this.gauge("east", `${metres(s.east)} m`, `east, sd ${spread(s.east_sd)} m`);
-    this.gauge("distance", `${metres(s.distance)} m`, "travelled");
-    this.gauge("verdict", s.verdict, "verdict", s.verdict === "wrong");
-    this.gauge("clock", clock(s.time), "time");
+    const [look, meaning] = VERDICTS[s.verdict];
+    this.gauge("status", "verdict", s.verdict, meaning, look);
+    this.gauge("status", "sd", `${metres(s.ellipse_sd)} m`, "position sd", kinds.has("position") ? "bad" : "good");
+    this.lock(s);
+    const begin = track.length ? track.time[0] : s.time;
+    this.gauge("times", "since", elapsed(s.time - begin), this.resumed ? "since it resumed" : "dive time");
+
+    const turn = ((s.yaw * DEG) % 360 + 360) % 360;
+    const degrees = turn.toFixed(1).padStart(5, "0");
+    const heading = this.gauge("gauges", "heading", `${degrees}°`, `heading, sd ${s.yaw_sd === null ? "–" : spread(s.yaw_sd * DEG)}°`, kinds.has("heading") ? "bad" : "", true);
+    const [n, e] = track.length ? [track.north[0] - s.north, track.east[0] - s.east] : [0, 0];
+    const [far, home] = [Math.hypot(n, e), Math.atan2(e, n)];
+    const away = far >= AT_HOME_M;
+    rose(heading.lastChild, s.yaw, s.yaw_sd, away ? home : null);
+    this.gauge("gauges", "home", `${metres(far)} m\n${away ? bearing(home) : "–"}`, this.resumed ? "to where it resumed" : "home, to the start");
+    this.gauge("gauges", "speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, `speed, ${s.speed === null ? "–" : (s.speed / KNOT).toFixed(1)} kn`);
+    if (s.altitude !== null || this.gauges.has("altitude")) this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
+    const depth = this.gauge("gauges", "depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m`, "", true);
+    depthCurve(depth.lastChild, track, s.time, s.down);
+    this.gauge("gauges", "north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);
+    this.gauge("gauges", "east", `${metres(s.east)} m`, `east, sd ${spread(s.east_sd)} m`);
+    this.gauge("gauges", "distance", `${metres(s.distance)} m`, "travelled");
+    this.gauge("gauges", "clock", clock(s.time), "time of the estimate");
     this.sensors(s.sensors);
     this.learnt(s.calibration, s.time);
   }
 
-  gauge(name, value, label, bad = false) {
+  lock(s) {
+    const state = s.sensors.dvl?.state;
+    if (state === undefined) this.gauge("status", "lock", "–", "no DVL");
+    else if (state === "ok") this.gauge("status", "lock", "locked", "bottom lock", "good");
+    else if (state === "rejected") this.gauge("status", "lock", "rejected", "DVL contradicts the estimate", "warn");
+    else this.gauge("status", "lock", state, `DVL, for ${duration(s.lock_lost_s)}`, "bad");
+  }
+
+  gauge(place, name, value, label, look = "", drawn = false) {
     let found = this.gauges.get(name);
     if (!found) {
-      found = element("div", "", "gauge");
+      found = element("div");
       found.append(element("b"), element("span"));
-      document.getElementById("gauges").append(found);
+      if (drawn) found.append(element("canvas"));
+      document.getElementById(place).append(found);
       this.gauges.set(name, found);
     }
     set(found.children[0], value);
     set(found.children[1], label);
-    found.classList.toggle("bad", bad);
+    found.className = `gauge ${name} ${look}`;
+    return found;
   }
 
   sensors(all) {
@@ -109,34 +144,11 @@ export class Gauges {
         found.values = found.values.filter((_, n) => n % 2);
         found.every *= 2;
       }
-      curve(found.canvas, found.values);
+      learntCurve(found.canvas, found.values);
     }
   }
 }
 
 function set(node, text) {
   if (node.textContent !== text) node.textContent = text;
-}
-
-// A band of one sd to either side of the value.
-function curve(canvas, values) {
-  const [w, h] = [130, 36];
-  const ratio = window.devicePixelRatio || 1;
-  [canvas.width, canvas.height] = [w * ratio, h * ratio];
-  const c = canvas.getContext("2d");
-  c.scale(ratio, ratio);
-  const low = Math.min(...values.map(([v, sd]) => v - sd));
-  const high = Math.max(...values.map(([v, sd]) => v + sd));
-  const x = (k) => (k / Math.max(1, values.length - 1)) * w;
-  const y = (v) => h - 2 - ((v - low) / Math.max(high - low, 1e-12)) * (h - 4);
-  c.beginPath();
-  values.forEach(([v, sd], k) => c.lineTo(x(k), y(v + sd)));
-  [...values].reverse().forEach(([v, sd], k) => c.lineTo(x(values.length - 1 - k), y(v - sd)));
-  c.fillStyle = "#c3d2ea";
-  c.fill();
-  c.beginPath();
-  values.forEach(([v], k) => c.lineTo(x(k), y(v)));
-  c.strokeStyle = "#0b3d91";
-  c.lineWidth = 2;
-  c.stroke();
 }

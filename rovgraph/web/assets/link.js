@@ -1,5 +1,7 @@
 // The connection to the estimator: a WebSocket for news, requests for commands. Addresses are relative, for proxies.
 
+import { keep, recall } from "./keep.js";
+
 const LOST_S = 3; // without a message, after which the connection counts as lost
 const RETRY_MS = 1000;
 
@@ -40,7 +42,7 @@ export class Link {
 
   use(token) {
     this.token = token;
-    keepToken(token);
+    keep("token", token);
   }
 
   async ask(address, method = "GET", body = undefined) {
@@ -58,12 +60,8 @@ function readToken() {
   const match = /(?:^#|&)token=([A-Za-z0-9_-]+)/.exec(location.hash);
   if (match) {
     history.replaceState(null, "", location.pathname + location.search + (location.hash.includes("widget") ? "#widget" : ""));
-    keepToken(match[1]);
+    keep("token", match[1]);
     return match[1];
   }
-  try { return localStorage.getItem("rovgraph-token") ?? ""; } catch { return ""; }
-}
-
-function keepToken(token) {
-  try { localStorage.setItem("rovgraph-token", token); } catch { /* a browser that keeps nothing asks again */ }
+  return recall("token") ?? "";
 }

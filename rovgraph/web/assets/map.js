@@ -1,15 +1,35 @@
 // A map of metres north and east: charts, grid, track, marks, and the vehicle with its ellipse.
 
+import { niceStep } from "./dials.js";
+import { blank, palette } from "./look.js";
 import { Track } from "./track.js";
 
 const ELLIPSE = Math.sqrt(-2 * Math.log(0.05)); // 95 % of a normal distribution in the plane
 const [LEAST_SCALE, MOST_SCALE] = [0.005, 2000]; // [pixels per metre]
 const TAP = 8; // pixels that a finger may move
 
+// Half axes of a state's 95 % ellipse [m], NaN where unknown, and the bearing of the longer one [rad].
+export function ellipse(s) {
+  const [a, b, cross] = [s.north_sd, s.east_sd].every((sd) => sd !== null) ? [s.north_sd ** 2, s.east_sd ** 2, s.cov_north_east] : [NaN, NaN, NaN];
+  const [mean, part] = [(a + b) / 2, Math.hypot((a - b) / 2, cross)];
+  const [longer, shorter] = [mean + part, mean - part].map((v) => ELLIPSE * Math.sqrt(Math.max(v, 0)));
+  return { longer, shorter, angle: 0.5 * Math.atan2(2 * cross, a - b) };
+}
+
+// The part of a line that is on the screen; null where there is none (Liang and Barsky).
+function clipped([x0, y0], [x1, y1], width, height) {
+  let [from, to] = [0, 1];
+  for (const [p, q] of [[x0 - x1, x0], [x1 - x0, width - x0], [y0 - y1, y0], [y1 - y0, height - y0]]) {
+    if (p === 0 && q < 0) return null;
+    if (p < 0) from = Math.max(from, q / p);
+    if (p > 0) to = Math.min(to, q / p);
+  }
+  return from < to ? [from, to].map((t) => [x0 + t * (x1 - x0), y0 + t * (y1 - y0)]) : null;
+}
+
 export class LiveMap {
   constructor(canvas, onTap, onMoved) {
     this.canvas = canvas;
-    this.context = canvas.getContext("2d");
     this.track = new Track();
     this.centre = [0, 0];
     this.scale = 20;
@@ -133,21 +153,18 @@ export class LiveMap {
   pointercancel(event) { this.pointers.delete(event.pointerId); }
 
   draw() {
-    const ratio = window.devicePixelRatio || 1;
-    [this.width, this.height] = [this.canvas.clientWidth, this.canvas.clientHeight];
-    const size = [Math.round(this.width * ratio), Math.round(this.height * ratio)];
-    if (this.canvas.width !== size[0] || this.canvas.height !== size[1]) [this.canvas.width, this.canvas.height] = size;
+    [this.context, this.width, this.height] = blank(this.canvas);
     [this.cos, this.sin] = [Math.cos(this.turn), Math.sin(this.turn)];
     const c = this.context;
-    c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    c.clearRect(0, 0, this.width, this.height);
     for (const chart of this.charts) this.drawChart(chart);
     this.drawGrid();
     c.lineWidth = 3;
     c.lineJoin = "round";
     this.track.draw(c, (n, e) => this.toScreen(n, e));
+    if (this.track.length) this.drawHome();
     for (const mark of this.state?.marks ?? []) this.drawMark(mark);
     if (this.state) this.drawVehicle(this.state);
+    this.drawNumbers();
     this.drawNorth();
   }
 
@@ -172,39 +189,72 @@ export class LiveMap {
     const c = this.context;
     c.beginPath();
     shape.points.forEach(([n, e], k) => c[k ? "lineTo" : "moveTo"](...this.toScreen(n, e)));
-    c.strokeStyle = "#555";
+    c.strokeStyle = palette.soft;
     c.lineWidth = 1.5;
     if (shape.form === "area") { c.closePath(); c.fillStyle = "rgba(120, 110, 80, .25)"; c.fill(); }
     if (shape.form === "point") c.arc(...this.toScreen(...shape.points[0]), 4, 0, 7);
     c.stroke();
-    if (shape.name) this.drawText(shape.name, ...this.toScreen(...shape.points[0]), "#333");
+    if (shape.name) this.drawText(shape.name, ...this.toScreen(...shape.points[0]), palette.soft);
+  }
+
+  // Lines of the grid: axis (0 = of one north), where on it, and their ends on the edges of the screen.
+  gridLines() {
+    const step = niceStep((this.width < 600 ? 60 : 90) / this.scale);
+    const reach = Math.hypot(this.width, this.height) / 2 / this.scale;
+    const lines = [];
+    for (const axis of [0, 1]) {
+      for (let k = Math.ceil((this.centre[axis] - reach) / step); k * step < this.centre[axis] + reach; k += 1) {
+        const ends = [-reach, reach].map((r) => (axis ? [this.centre[0] + r, k * step] : [k * step, this.centre[1] + r]));
+        const seen = clipped(...ends.map((end) => this.toScreen(...end)), this.width, this.height);
+        if (seen) lines.push([axis, k * step, seen]);
+      }
+    }
+    return [step, lines];
   }
 
   drawGrid() {
     const c = this.context;
-    const wanted = 90 / this.scale;
-    const power = 10 ** Math.floor(Math.log10(wanted));
-    const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= wanted);
-    const reach = Math.hypot(this.width, this.height) / 2 / this.scale;
-    c.strokeStyle = "#b9c2cc";
+    c.strokeStyle = palette.grid;
     c.lineWidth = 1;
     c.beginPath();
-    for (const axis of [0, 1]) {
-      for (let k = Math.ceil((this.centre[axis] - reach) / step); k * step < this.centre[axis] + reach; k += 1) {
-        const ends = [-reach, reach].map((r) => (axis ? [this.centre[0] + r, k * step] : [k * step, this.centre[1] + r]));
-        c.moveTo(...this.toScreen(...ends[0]));
-        c.lineTo(...this.toScreen(...ends[1]));
-      }
+    for (const [, , [from, to]] of this.gridLines()[1]) {
+      c.moveTo(...from);
+      c.lineTo(...to);
     }
     c.stroke();
-    const [x, y] = [this.width - 20 - step * this.scale, this.height - (this.width < 800 ? 134 : 76)];
-    c.strokeStyle = "#000";
+  }
+
+  // What a line's place is, where it meets the left or the lower edge; and the length of a step.
+  drawNumbers() {
+    const c = this.context;
+    const [step, lines] = this.gridLines();
+    for (const [axis, value, ends] of lines) {
+      const left = ends.find((end) => end[0] < 1);
+      const end = left ?? ends.find((one) => one[1] > this.height - 1);
+      if (!end || (left ? end[1] < 16 || end[1] > this.height - 36 : end[0] < 44 || end[0] > this.width - 56)) continue;
+      const text = `${+Math.abs(value).toPrecision(6)} ${(axis ? "WE" : "SN")[+(value >= 0)]}`;
+      this.drawText(text, end[0], end[1] - (left ? 0 : 4), palette.soft);
+    }
+    const [x, y] = [this.width - 12 - step * this.scale, this.height - 34];
+    c.strokeStyle = palette.ink;
     c.lineWidth = 3;
     c.beginPath();
-    c.moveTo(x, y);
-    c.lineTo(x + step * this.scale, y);
+    for (const [px, py] of [[0, -6], [0, 0], [step * this.scale, 0], [step * this.scale, -6]]) c.lineTo(x + px, y + py);
     c.stroke();
-    this.drawText(`${+step.toPrecision(2)} m`, x - 6, y - 6, "#000");
+    this.drawText(`${+step.toPrecision(2)} m`, x, y - 6, palette.ink);
+  }
+
+  drawHome() {
+    const c = this.context;
+    const [x, y] = this.toScreen(this.track.north[0], this.track.east[0]);
+    c.beginPath();
+    for (const [px, py] of [[0, -11], [10, -2], [7, -2], [7, 8], [-7, 8], [-7, -2], [-10, -2]]) c.lineTo(x + px, y + py);
+    c.closePath();
+    c.fillStyle = palette.sure;
+    c.fill();
+    c.strokeStyle = palette.paper;
+    c.lineWidth = 2;
+    c.stroke();
   }
 
   drawMark(mark) {
@@ -212,7 +262,7 @@ export class LiveMap {
     const [x, y] = this.toScreen(mark.north, mark.east);
     if (mark.number === this.selected && this.state) {
       c.setLineDash([8, 6]);
-      c.strokeStyle = "#000";
+      c.strokeStyle = palette.ink;
       c.lineWidth = 2;
       c.beginPath();
       c.moveTo(...this.toScreen(this.state.north, this.state.east));
@@ -220,22 +270,22 @@ export class LiveMap {
       c.stroke();
       c.setLineDash([]);
     }
-    c.fillStyle = mark.kind === "mark" ? "#fff" : "#ffd400";
-    c.strokeStyle = "#000";
+    c.fillStyle = mark.kind === "mark" ? palette.paper : palette.mark;
+    c.strokeStyle = palette.ink;
     c.lineWidth = 2.5;
     c.beginPath();
     if (mark.kind === "mark") c.arc(x, y, 7, 0, 7);
     else c.rect(x - 6, y - 6, 12, 12);
     c.fill();
     c.stroke();
-    this.drawText(mark.name || `${mark.number}`, x + 6, y - 6, "#000");
+    this.drawText(mark.name || `${mark.number}`, x + 6, y - 6, palette.ink);
   }
 
   drawText(text, x, y, colour) {
     const c = this.context;
     c.font = "600 14px system-ui, sans-serif";
     c.lineWidth = 4;
-    c.strokeStyle = "#fff";
+    c.strokeStyle = palette.sea;
     c.strokeText(text, x + 4, y - 2);
     c.fillStyle = colour;
     c.fillText(text, x + 4, y - 2);
@@ -244,16 +294,15 @@ export class LiveMap {
   drawVehicle(s) {
     const c = this.context;
     const [x, y] = this.toScreen(s.north, s.east);
-    const [a, b, cross] = [s.north_sd ** 2, s.east_sd ** 2, s.cov_north_east];
-    const [mean, part] = [(a + b) / 2, Math.hypot((a - b) / 2, cross)];
-    const axes = [mean + part, mean - part].map((v) => ELLIPSE * Math.sqrt(Math.max(v, 0)) * this.scale);
-    const bearing = 0.5 * Math.atan2(2 * cross, a - b); // of the longer axis, clockwise from north
-    if (axes.every(Number.isFinite) && axes[0] < 1e6) {
+    const { longer, shorter, angle } = ellipse(s);
+    if (longer * this.scale < 1e6) {
       c.beginPath();
-      c.ellipse(x, y, axes[0], axes[1], bearing - this.turn - Math.PI / 2, 0, 2 * Math.PI);
-      c.fillStyle = "rgba(11, 61, 145, .15)";
+      c.ellipse(x, y, longer * this.scale, shorter * this.scale, angle - this.turn - Math.PI / 2, 0, 2 * Math.PI);
+      c.globalAlpha = 0.18;
+      c.fillStyle = palette.sure;
       c.fill();
-      c.strokeStyle = "#0b3d91";
+      c.globalAlpha = 1;
+      c.strokeStyle = palette.sure;
       c.lineWidth = 2;
       c.stroke();
     }
@@ -263,9 +312,9 @@ export class LiveMap {
     c.beginPath();
     for (const [px, py] of [[0, -18], [10, 12], [0, 6], [-10, 12]]) c.lineTo(px, py);
     c.closePath();
-    c.fillStyle = "#000";
+    c.fillStyle = palette.ink;
     c.fill();
-    c.strokeStyle = "#fff";
+    c.strokeStyle = palette.paper;
     c.lineWidth = 2;
     c.stroke();
     c.restore();
@@ -274,14 +323,14 @@ export class LiveMap {
   drawNorth() {
     const c = this.context;
     c.save();
-    c.translate(this.width - 30, 92);
+    c.translate(this.width - 26, 30);
     c.rotate(-this.turn);
     c.beginPath();
     for (const [px, py] of [[0, -22], [8, 8], [0, 3], [-8, 8]]) c.lineTo(px, py);
     c.closePath();
-    c.fillStyle = "#b00020";
+    c.fillStyle = palette.bad;
     c.fill();
     c.restore();
-    this.drawText("N", this.width - 39, 120, "#000");
+    this.drawText("N", this.width - 35, 58, palette.ink);
   }
 }

@@ -2,10 +2,13 @@
 
 import { bearing, clock, duration, element, Gauges, metres } from "./gauges.js";
 import { Link } from "./link.js";
-import { LiveMap } from "./map.js";
-import { COLOURS, colourEnd } from "./track.js";
+import { Look, palette } from "./look.js";
+import { ellipse, LiveMap } from "./map.js";
+import { Siren } from "./siren.js";
+import { colourEnd } from "./track.js";
 
 const SHOWN_EVENTS = 200;
+const SHOWN_ALARMS = 4;
 const STALE_S = 2; // without a solution
 const GATE = 6; // of fixes, fix.gate_sd as it is by default
 const widget = location.hash.includes("widget"); // the map alone, as in Cockpit
@@ -13,8 +16,16 @@ const at = (id) => document.getElementById(id);
 
 const gauges = new Gauges();
 const map = new LiveMap(at("map"), tapped, showButtons);
+const siren = new Siren(at("sound"));
 let state = null;
 let chartsPlaced = false;
+
+const look = new Look((dark) => {
+  at("look").textContent = dark ? "Day" : "Dark";
+  if (state) showNumbers();
+  map.changed();
+});
+at("look").addEventListener("click", () => look.toggle());
 
 const link = new Link({
   message(news) {
@@ -23,6 +34,7 @@ const link = new Link({
     if (news.type === "begin") {
       map.track.clear();
       gauges.units = news.units;
+      gauges.resumed = false;
       at("events").replaceChildren();
       addEvents(news.events);
     } else if (news.type === "track") {
@@ -34,7 +46,10 @@ const link = new Link({
     }
     map.changed();
   },
-  lost() { connection("no connection to rovgraph: what you see is old", true); },
+  lost() {
+    connection("no connection to rovgraph: what you see is old", true);
+    if (state) siren.tell([["connection", "wrong"]]);
+  },
   refused() {
     connection("locked", true);
     document.body.classList.remove("widget");
@@ -45,6 +60,7 @@ const link = new Link({
 function connection(text, bad) {
   if (at("connection").textContent !== text) at("connection").textContent = text;
   at("connection").className = bad ? "bad" : "good";
+  document.body.classList.toggle("old", bad);
 }
 
 function showState(news) {
@@ -57,8 +73,8 @@ function showState(news) {
   const old = news.age_s > STALE_S;
   connection(old ? `no solution for ${duration(news.age_s)}` : "live", old);
   map.show(news);
-  gauges.show(news);
-  showAlarms(news);
+  showNumbers();
+  showAlarms(news, old);
   showMarks(news.marks);
   if (!chartsPlaced && news.latitude !== null) {
     chartsPlaced = true;
@@ -66,16 +82,34 @@ function showState(news) {
   }
 }
 
-function showAlarms(news) {
-  const all = [...news.alarms.map((a) => [a.severity, `${a.sensor}: ${a.kind}: ${a.text}`]), ...news.limits.map((a) => ["wrong", a.text])];
-  const key = JSON.stringify(all);
-  if (at("alarms").dataset.key === key) return;
-  at("alarms").dataset.key = key;
-  at("alarms").replaceChildren(...all.slice(0, 5).map(([severity, text]) => element("p", text, severity)));
+function showNumbers() {
+  gauges.show(state, map.track);
+  const { longer, shorter } = ellipse(state);
+  at("ellipse-legend").textContent = `ellipse: 95 %${longer >= 0 ? `, half axes ${metres(longer)} × ${metres(shorter)} m` : ""}`;
+}
+
+// The gravest first. What an alarm is about stays the same while the numbers in its text change.
+function showAlarms(news, old) {
+  const all = [
+    ...news.limits.map((a) => ["wrong", a.text, `${a.kind} ${a.text.replace(/[\d.]+/g, "")}`]),
+    ...news.alarms.map((a) => [a.severity, `${a.text.startsWith(`${a.sensor}:`) ? "" : `${a.sensor}: `}${a.text}`, `${a.sensor} ${a.kind} ${a.severity}`]),
+  ].sort((a, b) => (b[0] === "wrong") - (a[0] === "wrong"));
+  const red = [...(old ? ["old"] : []), ...(news.lock_lost_s > 0 ? ["lock"] : [])].map((name) => [name, "wrong"]);
+  siren.tell([...all.map(([severity, , name]) => [name, severity]), ...red]);
+  const lines = all.slice(0, SHOWN_ALARMS);
+  if (all.length > SHOWN_ALARMS) lines.push(["more", `and ${all.length - SHOWN_ALARMS} more, see the events`]);
+  const shown = at("alarms").children;
+  while (shown.length > lines.length) shown[lines.length].remove();
+  lines.forEach(([severity, text], k) => {
+    if (!shown[k]) at("alarms").append(element("p"));
+    if (shown[k].textContent !== text) shown[k].textContent = text;
+    shown[k].className = severity;
+  });
 }
 
 function addEvents(events) {
   for (const event of events) {
+    if (event.kind === "resumed") gauges.resumed = true;
     at("events").prepend(element("li", `${clock(event.time)} ${event.source} ${event.kind}: ${event.text}`));
   }
   while (at("events").children.length > SHOWN_EVENTS) at("events").lastChild.remove();
@@ -249,14 +283,21 @@ at("login").addEventListener("submit", (event) => {
   link.use(at("token").value.trim());
 });
 
-at("legend").append("sd in m ", ...COLOURS.map((colour, k) => {
-  const last = k === COLOURS.length - 1;
+at("sd-legend").append(...palette.sd.map((_, k) => {
+  const last = k === palette.sd.length - 1;
   const row = element("span", last ? "more" : `${colourEnd(k)}`);
-  row.style.borderBottomColor = colour;
+  row.style.borderBottomColor = `var(--sd-${k})`;
   return row;
 }));
+
+function showClock() {
+  at("wall-clock").textContent = new Date().toTimeString().slice(0, 8);
+}
+setInterval(showClock, 1000);
+showClock();
+
 document.body.classList.toggle("widget", widget);
-window.rovgraph = { map }; // for tests, and for a look by the developers' tools
+window.rovgraph = { map, siren }; // for tests, and for a look by the developers' tools
 loadChartsNote();
 
 async function loadChartsNote() {

@@ -1,9 +1,11 @@
 // The track in growing typed arrays, and its colours by uncertainty.
 
-export const COLOURS = ["#0b3d91", "#0a6fb5", "#00857a", "#3f8f2f", "#a37c00", "#c45a00", "#c21f1f", "#7a0050"];
-const LEAST = 0.1; // sd of the first colour's end [m]; each next one ends at twice that
+import { palette } from "./look.js";
 
-export const colourOf = (sd) => Math.max(0, Math.min(COLOURS.length - 1, Math.ceil(Math.log2(sd / LEAST))));
+const LEAST = 0.1; // sd of the first colour's end [m]; each next one ends at twice that
+const ARRAYS = ["time", "north", "east", "down"];
+
+export const colourOf = (sd) => Math.max(0, Math.min(palette.sd.length - 1, Math.ceil(Math.log2(sd / LEAST))));
 export const colourEnd = (k) => LEAST * 2 ** k;
 
 export class Track {
@@ -11,27 +13,32 @@ export class Track {
 
   clear() {
     this.length = 0;
-    this.north = new Float64Array(4096);
-    this.east = new Float64Array(4096);
+    for (const name of ARRAYS) this[name] = new Float64Array(4096);
     this.colour = new Uint8Array(4096);
   }
 
   add(points) {
-    for (const [, north, east, , sd] of points) {
+    for (const point of points) {
       if (this.length === this.north.length) this.grow();
-      this.north[this.length] = north;
-      this.east[this.length] = east;
-      this.colour[this.length] = colourOf(sd);
+      ARRAYS.forEach((name, k) => { this[name][this.length] = point[k]; });
+      this.colour[this.length] = colourOf(point[4]);
       this.length += 1;
     }
   }
 
   grow() {
-    for (const name of ["north", "east", "colour"]) {
+    for (const name of [...ARRAYS, "colour"]) {
       const larger = new this[name].constructor(2 * this[name].length);
       larger.set(this[name]);
       this[name] = larger;
     }
+  }
+
+  // Time and depth of the points from a time on.
+  since(time) {
+    let k = this.length;
+    while (k > 0 && this.time[k - 1] >= time) k -= 1;
+    return Array.from({ length: this.length - k }, (_, n) => [this.time[k + n], this.down[k + n]]);
   }
 
   // Strokes of one colour each; what is nearer than a pixel and a half is passed over.
@@ -44,7 +51,7 @@ export class Track {
       if (this.colour[k] !== colour) {
         if (colour >= 0) { context.lineTo(nextX, nextY); context.stroke(); }
         colour = this.colour[k];
-        context.strokeStyle = COLOURS[colour];
+        context.strokeStyle = palette.sd[colour];
         context.beginPath();
         context.moveTo(nextX, nextY);
       } else {
