@@ -122,7 +122,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
     """A dive, solved by both until neither moves any more."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
-        patch.setattr(gauss_newton, "REST", EXACT)
+        patch.setattr(gauss_newton, "FINAL_TOLERANCE", EXACT)
         dive = batch(*SCENARIOS[request.param]())
         b = dive.initial
         states = dead_reckon(dive.problem, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
@@ -205,7 +205,7 @@ def test_what_is_estimated_or_considered_afterwards_is_as_if_it_had_been_from_th
     states = dead_reckon(b.problem, b.initial, {n: belief.mean for n, belief in beliefs(b.initial.config).items()})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
-        patch.setattr(gauss_newton, "REST", EXACT)
+        patch.setattr(gauss_newton, "FINAL_TOLERANCE", EXACT)
         held = smooth_chain(b.problem, b.initial, states)
         assert held.unknowns.considered == ("dvl_pitch",)
         found = held.estimating(["dvl_pitch"])
@@ -268,7 +268,7 @@ def test_both_move_alike_when_a_constant_is_considered(solved):
     constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
-        patch.setattr(gauss_newton, "REST", EXACT)
+        patch.setattr(gauss_newton, "FINAL_TOLERANCE", EXACT)
         a, b = (best.considering(constant[:1]) for best in solved)
         again = [one.estimating(constant[:1]) for one in (a, b)]
     assert a.solution.cost == pytest.approx(b.solution.cost, rel=1e-6)

@@ -44,7 +44,7 @@ def test_a_dive_that_tilts_far_shows_the_scales_of_accelerometer_and_gyro(estima
 
 
 def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows(monkeypatch):
-    for tolerance in ("FINE", "REST"):
+    for tolerance in ("FINE", "FINAL_TOLERANCE"):
         monkeypatch.setattr(gauss_newton, tolerance, 1e-9)
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))

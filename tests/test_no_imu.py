@@ -360,7 +360,7 @@ def test_a_pd0_file_of_a_real_vehicle_becomes_a_smoothed_track(tmp_path, monkeyp
 
 def test_gtsam_finds_the_same_optimum(dive, monkeypatch):
     pytest.importorskip("gtsam")
-    for tolerance in ("FINE", "REST"):
+    for tolerance in ("FINE", "FINAL_TOLERANCE"):
         monkeypatch.setattr(gauss_newton, tolerance, 1e-11)
     from rovgraph.inference.graph.places import smooth_graph
 

@@ -15,7 +15,7 @@ from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.inference import gauss_newton
 from rovgraph.inference.chain import CLONED, COLUMNS, MOTION, NOTHING, Chain, ChainStep
 from rovgraph.inference.chain_information import MeasurementRows, SquareRoot
-from rovgraph.inference.faulty_intervals import Searches, at_rest, resume, solve
+from rovgraph.inference.faulty_intervals import Searches, converged, resume, solve
 from rovgraph.inference.gauss_newton import Gates, GaussNewtonResult, left_after, whole_share
 from rovgraph.inference.optimum import Knowledge
 from rovgraph.inference.widened_chain import widened
@@ -238,7 +238,7 @@ class ChainOptimum:
         root = self.at_hand or self.wide.eliminate(self.linearised_at, gates, diagonal=True)
         return root.log_determinant(held), root.least(held)
 
-    def rested(self) -> "ChainOptimum":
+    def with_final_step(self) -> "ChainOptimum":
         """The optimum after a final step, from the elimination that gives its covariances.
 
         Raises
@@ -248,15 +248,15 @@ class ChainOptimum:
         known = self.solution
         if not known.converged:
             return self
-        promised, decrease, step, rested = self._last_step()
-        if rested is not None:
-            return rested
+        promised, decrease, step, there = self._last_step()
+        if there is not None:
+            return there
         point = self.wide.moved(self.state, step, 1.0)
         further = self.wide.moved(self.state, step, whole_share(promised, decrease))
-        some = [one for one in (at_rest(self.chain, there, known) for there in (further, point)) if one]
+        some = [one for one in (converged(self.chain, at, known) for at in (further, point)) if one]
         ahead = min(some, key=lambda one: one.cost, default=known)
         if ahead.cost < known.cost and known.iterations < gauss_newton.MAX_ITERATIONS:
-            return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
+            return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).with_final_step()
         again = resume(self.chain, self.state, known)
         return ChainOptimum(self.chain, replace(again, iterations=known.iterations + again.iterations))
 
@@ -267,14 +267,14 @@ class ChainOptimum:
         step = ChainStep(x, y)
         point = self.wide.moved(self.state, step, 1.0)
         decrease = self.chain.cost(self.state, known.gates) - self.chain.cost(point, known.gates)
-        if promised > gauss_newton.REST or left_after(promised, decrease) > gauss_newton.FINE:
+        if promised > gauss_newton.FINAL_TOLERANCE or left_after(promised, decrease) > gauss_newton.FINE:
             return promised, decrease, step, None
         there = replace(known, point=point, cost=known.cost - decrease, iterations=known.iterations + 1)
         root.move_to(y)
         self.at_hand = None  # errors count from there now
-        rested = ChainOptimum(self.chain, there, self.state, root)
-        rested.wide = self.wide
-        return promised, decrease, step, rested
+        after = ChainOptimum(self.chain, there, self.state, root)
+        after.wide = self.wide
+        return promised, decrease, step, after
 
     def _other(self, chain: Chain, moved: Mapping[str, Array], score: Array | None = None) -> "ChainOptimum":
         """The optimum of a chain with other unknowns of these, from where its linear problem has it.
@@ -285,8 +285,10 @@ class ChainOptimum:
         score : ndarray, shape (c,), as `SquareRoot.border_with`
         """
         begin = self._moved_to(chain.unknowns.estimated, moved, score)
-        known = at_rest(chain, begin, self.solution) or resume(chain, begin, self.solution, gauss_newton.REST)
-        return ChainOptimum(chain, known).rested()
+        known = converged(chain, begin, self.solution) or resume(
+            chain, begin, self.solution, gauss_newton.FINAL_TOLERANCE
+        )
+        return ChainOptimum(chain, known).with_final_step()
 
     def _moved_to(self, estimated: Sequence[str], moved: Mapping[str, Array], score: Array | None) -> State:
         """Where the linear problem has its least sum with these estimated, and the rest as in `_other`."""
@@ -416,5 +418,5 @@ def smooth_chain(
     chain = Chain(problem, initial, beliefs, wanted.estimating(wanted.considered) if freed else wanted)
     held = [name for name in chain.unknowns.considered if not beliefs[name].variable.time_offset]
     free = partial(widened, chain, names=tuple(held)) if held else None
-    solution = solve(chain, chain.start(states, calibration), free, window, searches, gauss_newton.REST)
-    return ChainOptimum(chain, solution).rested()
+    solution = solve(chain, chain.start(states, calibration), free, window, searches, gauss_newton.FINAL_TOLERANCE)
+    return ChainOptimum(chain, solution).with_final_step()

@@ -228,7 +228,7 @@ def resume(
     return _with_stretches(problem, minimise(problem, point, known.gates, barred, tolerance), known)
 
 
-def at_rest(
+def converged(
     problem: Linearizable[Point, Step], point: Point, known: GaussNewtonResult[Point]
 ) -> GaussNewtonResult[Point] | None:
     """A known solution moved to a point close by, with its gates and stretches; None = gates change there."""

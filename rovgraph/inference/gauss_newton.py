@@ -27,7 +27,7 @@ MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
 FINE = 1e-3  # decrease of the cost that is left when the last round stops: 0.045 sd
-REST = 5e-3  # the same where one more step is taken, of the elimination that covariances come of
+FINAL_TOLERANCE = 5e-3  # the same where one more step is taken, of the elimination that covariances come of
 COARSE = 1e-2  # the same as a part of the cost, of the rounds before the gates rest
 
 # a parabola with the slope that is promised and the decrease that is found is lower at twice the step from here on
