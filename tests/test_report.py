@@ -570,9 +570,9 @@ def test_figures_leave_matplotlib_as_it_was(dive, tmp_path):
 
 
 def test_wrapped_heading_is_broken():
-    from rovgraph.report.style import broken
+    from rovgraph.report.motion import unwrapped
 
-    time, angle, sd = broken(np.arange(4.0), np.array([350.0, 359.0, 2.0, 5.0]), np.ones(4))
+    time, angle, sd = unwrapped(np.arange(4.0), np.array([350.0, 359.0, 2.0, 5.0]), np.ones(4))
     np.testing.assert_array_equal(angle, [350, 359, np.nan, 2, 5])
     assert len(time) == len(sd) == 5 and np.isnan(time[2])
 

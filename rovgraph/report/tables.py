@@ -14,7 +14,7 @@ from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.inference.observability import UNOBSERVABLE
 from rovgraph.log.units import shown
 from rovgraph.report.results import main_first, narrowing
-from rovgraph.report.units import label_with_unit, percent, plus_minus
+from rovgraph.report.units import duration, label_with_unit, percent, plus_minus
 
 
 def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:
@@ -75,17 +75,6 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
         notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")
     table.caption = "\n".join(notes) or None
     return table
-
-
-def duration(seconds: float | None) -> str:
-    """Time in words, such as ``55 min 43 s``."""
-    if seconds is None:
-        return "unknown"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
 def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:

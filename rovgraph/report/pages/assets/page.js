@@ -35,8 +35,17 @@
     const i = before(times, t), j = Math.min(i + 1, times.length - 1);
     return Math.abs(times[j] - t) < Math.abs(times[i] - t) ? j : i;
   };
-  const number = (v) => (Number.isFinite(v) ? String(Math.abs(v) < 1000 ? +v.toPrecision(4) : +v.toFixed(1)) : "unknown");
-  const metres = (v) => (Number.isFinite(v) ? v.toFixed(2) : "unknown");
+  // A thousandth of what an axis spans is its last digit; less than that is 0.
+  const number = (v, span) => {
+    if (!Number.isFinite(v)) return "unknown";
+    if (!(span > 0)) return String(+v.toPrecision(4));
+    const digits = Math.min(Math.max(3 - Math.ceil(Math.log10(span)), 0), 9);
+    return Math.abs(v) < span / 1000 ? "0" : v.toFixed(digits).replace("-", "−");
+  };
+  const spanOf = (axis) => (axis.type === "log" ? NaN : Math.abs(axis.range[1] - axis.range[0]));
+  const unitOf = (label) => (/\[(.+)\]/.exec(label) || ["", ""])[1];
+  const narrow = () => innerWidth < 700;
+  const metres = (v) => (Number.isFinite(v) ? (Math.abs(v) < 0.005 ? 0 : v).toFixed(Math.abs(v) < 100 ? 2 : 1).replace("-", "−") : "unknown");
 
   // ---- drawing -------------------------------------------------------------------------------
   const axis = (title, log, ticks) => ({
@@ -54,14 +63,17 @@
     const shaded = ([from, to, colour]) => ({ type: "rect", yref: "paper", y0: 0, y1: 1, x0: from, x1: to,
       fillcolor: colour, opacity: 0.18, line: { width: 0 }, layer: "below" });
     const layout = {
-      margin: { l: 60, r: 12, t: 6, b: 44 }, font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
+      margin: { l: narrow() ? 46 : 60, r: 12, t: 6, b: 44 }, dragmode: narrow() ? false : "zoom", font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
       xaxis: axis(panel.x, panel.log.includes("x"), 12), yaxis: axis(panel.y, panel.log.includes("y"), panel.kind === "map" ? 12 : 6),
-      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.some((t) => t.name && t.showlegend !== false),
+      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.filter((t) => t.name && t.showlegend !== false).length > (panel.kind === "time" || panel.kind === "xy" ? 1 : 0),
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
     for (const key of panel.log) if (!spansDecade(series, key)) layout[`${key}axis`].dtick = "D1"; // else it has no number
-    if (panel.reach) layout.yaxis.range = [-panel.reach, panel.reach];
+    if (panel.limits) layout.yaxis.range = panel.down ? [...panel.limits].reverse() : [...panel.limits];
+    else if (panel.down) layout.yaxis.autorange = "reversed";
+    if (panel.limits && panel.y.startsWith("heading [") && panel.limits[1] - panel.limits[0] > 220)
+      Object.assign(layout.yaxis, { tick0: 0, dtick: 90 });
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
     if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
       range: [panel.names.length + 0.7, 0.3] });
@@ -73,26 +85,38 @@
     return layout;
   };
   const traceOf = (panel, trace) => {
-    const digits = panel.kind === "map" ? ".2f" : ".5g";
+    const digits = panel.kind === "map" ? ".2f" : ".4g";
     const arrays = { x: unpack(trace.x), y: unpack(trace.y) };
     if (trace.t) arrays.t = unpack(trace.t);
     if (trace.value) arrays.value = arrays.customdata = unpack(trace.value); // what is told in the place of y
-    const told = `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}}`;
+    if (trace.sd) arrays.sd = unpack(trace.sd);
+    const unit = unitOf(panel.y);
+    const told = panel.kind !== "map" ? `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}} ${unit}`
+      : `east %{x:.2f} m, north %{y:.2f} m${trace.value ? "<br>sd %{customdata:.2g} m" : ""}`;
     const plain = String(trace.name ?? "").replaceAll("&", "&amp;").replaceAll("<", "&lt;"); // Plotly takes tags in names
     return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays, name: plain, label: trace.name };
+  };
+
+  // A line with an sd has a band of so many of them to each side.
+  const withBand = (s) => {
+    if (!s.sd) return [s];
+    const edge = (sign) => ({ ...s, y: s.y.map((v, i) => v + sign * s.band * s.sd[i]), line: { ...s.line, width: 0 }, sd: undefined,
+      showlegend: false, legendgroup: s.label, hoverinfo: "skip", hovertemplate: undefined, quiet: true,
+      label: `${s.label} ${sign < 0 ? "−" : "+"} ${s.band} sd` });
+    return [edge(-1), { ...edge(1), fill: "tonexty", fillcolor: s.line.color + "2e" }, { ...s, legendgroup: s.label }];
   };
 
   const draw = async (figure) => {
     const key = figure.dataset.panel;
     if (drawn.has(key)) return;
     const panel = data.panels[key], plot = figure.querySelector(".plot");
-    const series = panel.traces.map((trace) => traceOf(panel, trace));
+    const series = panel.traces.map((trace) => traceOf(panel, trace)).flatMap(withBand);
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
     if (panel.names.length && panel.kind !== "time") plot.style.height = `${110 + 22 * panel.names.length}px`;
-    const options = { responsive: true, displaylogo: false, scrollZoom: false,
+    const options = { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover", scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
+      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoom2d", "zoomIn2d", "zoomOut2d"], modeBarButtonsToAdd: [exportButton(entry)] };
     // an axis shows only where something stands over it
     const degrees = panel.kind === "map" && data.origin ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
     await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel, series), options);
@@ -169,7 +193,7 @@
     const common = { overlaying: "x", showgrid: true, gridcolor: "#b5c9d6", griddash: "dot", tickfont: { size: 10, color: "#3d5a6c" }, zeroline: false, tickmode: "array", automargin: true };
     layout.xaxis2 = { ...common, side: "top", matches: "x", ...lines(x, o.lon, o.lon_m, "EW", innerWidth < 700 ? 2 : 5) };
     layout.yaxis2 = { ...common, overlaying: "y", side: "right", matches: "y", ...lines(y, o.lat, o.lat_m, "NS", 6) };
-    layout.legend = { orientation: "h", y: -0.12, yanchor: "top", x: 0, font: { size: 12 } };
+    layout.legend = { orientation: "h", y: narrow() ? -0.2 : -0.1, yanchor: "top", x: 0, font: { size: narrow() ? 11 : 12 } };
   };
   const regrid = async (entry) => {
     const full = entry.plot._fullLayout, layout = {};
@@ -209,8 +233,14 @@
     const named = (s) => (/\d$/.test(s.label) ? `${s.label}:` : s.label); // a number beside a number
     const near = (xaxis.range[1] - xaxis.range[0]) / 200; // under the mouse; a line is known between its points
     const here = (s) => s.x.length && (s.mode !== "markers" || Math.abs(s.x[nearest(s.x, now)] - now) <= near);
-    const told = entry.series.filter((s) => !s.quiet && here(s)).map((s) => `${named(s)} ${number((s.value || s.y)[nearest(s.x, now)])}`);
-    entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
+    const log = entry.panel.log.includes("y"), span = log ? NaN : spanOf(yaxis), unit = unitOf(entry.panel.y);
+    const tell = (s) => {
+      const i = nearest(s.x, now), value = (s.value || s.y)[i], sd = s.sd ? s.sd[i] : NaN;
+      if (!Number.isFinite(value)) return `${named(s)} unknown`;
+      return `${named(s)} ${number(value, s.value ? NaN : span)}${Number.isFinite(sd) ? ` ± ${+sd.toPrecision(2)}` : ""}${unit === "°" ? "" : unit && " "}${unit}`;
+    };
+    const told = entry.series.filter((s) => !s.quiet && s.visible !== "legendonly" && here(s)).map(tell);
+    entry.readout.textContent = `at ${+now.toFixed(data.clock.unit === "s" ? 1 : 2)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
   };
   const place = (entry) => { // the vehicle with its ellipse, and the scale bar
     if (!entry.layer || !entry.plot._fullLayout.xaxis._length) return;
@@ -265,9 +295,9 @@
     let text = `${now.toFixed(unit === "s" ? 1 : 2)} ${unit}`;
     if (cursor) {
       const v = vehicle(now), heading = (((v.yaw * 180) / Math.PI) % 360 + 360) % 360;
-      text += ` · north ${metres(v.north)} m, east ${metres(v.east)} m, down ${metres(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
-      text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
-      if (data.origin) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
+      text += ` · north ${metres(v.north)} m, east ${metres(v.east)} m, depth ${metres(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
+      if (!narrow()) text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
+      if (data.origin && !narrow()) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
     }
     output.textContent = text;
     slider.setAttribute("aria-valuetext", text);
@@ -290,7 +320,28 @@
   const seen = new IntersectionObserver((entries) => {
     for (const e of entries) if (e.isIntersecting) { seen.unobserve(e.target); draw(e.target); }
   }, { rootMargin: "400px" });
-  figures.forEach((f) => seen.observe(f));
-  addEventListener("beforeprint", () => figures.forEach(draw));
-  window.rovgraph = { drawn, draw, drawAll: async () => { for (const f of figures) await draw(f); }, setTime, zoom, vehicle };
+  figures.forEach((f) => seen.observe(f)); // one that is folded comes into view when it is opened
+  const unfold = () => {
+    const section = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    const fold = section && section.querySelector(":scope > details.fold");
+    if (fold && !fold.open) { fold.open = true; section.scrollIntoView(); }
+  };
+  addEventListener("hashchange", unfold);
+  document.querySelectorAll("nav a").forEach((a) => a.addEventListener("click", () => setTimeout(unfold)));
+  document.querySelectorAll("details.fold").forEach((d) => d.addEventListener("toggle", () => { // the window may have changed meanwhile
+    if (d.open) for (const entry of drawn.values()) if (d.contains(entry.plot) && entry.layer) Plotly.Plots.resize(entry.plot);
+  }));
+  unfold();
+
+  // ---- the printed page has the map alone ----------------------------------------------------
+  const map = document.getElementById("track");
+  const resizeMap = (size) => { const e = drawn.get("track"); if (e && e.layer) Plotly.relayout(e.plot, size); };
+  addEventListener("beforeprint", () => { if (map && map.dataset.panel) resizeMap({ width: 680, height: 560 }); });
+  addEventListener("afterprint", () => resizeMap({ width: undefined, height: undefined, autosize: true }));
+
+  const drawAll = async () => {
+    document.querySelectorAll("details.fold").forEach((d) => { d.open = true; });
+    for (const f of figures) await draw(f);
+  };
+  window.rovgraph = { drawn, draw, drawAll, setTime, zoom, vehicle };
 })();
