@@ -51,8 +51,8 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
     return table
 
 
-def calibration_table(estimates: Sequence[Estimate]) -> Table:
-    """Calibration of the leading estimate beside its prior."""
+def calibration_table(estimates: Sequence[Estimate], verbose: bool = False) -> Table:
+    """Calibration of the leading estimate beside its prior; names of what is held at 0 only where ``verbose``."""
     main = main_first(estimates)[0]
     table = Table(
         title=f"calibration, {main.kind.replace('_', ' ')}",
@@ -70,7 +70,9 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
         name = label_with_unit(entry.label, entry.unit)
         table.add_row(escape(name), *_calibration_cells(entry), style="" if entry.estimated else "dim")
     notes = ["left: sd in percent of the prior's"] if any(e.estimated for e in shown) else []
-    notes += [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
+    if silent:
+        held = f"{len(silent)} calibration {'constant is' if len(silent) == 1 else 'constants are'} held at 0"
+        notes.append(f"{held}: {', '.join(e.label for e in silent)}" if verbose else f"{held} (--verbose lists them)")
     if any(e.verdict == UNOBSERVABLE for e in main.calibration):
         notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")
     table.caption = "\n".join(notes) or None

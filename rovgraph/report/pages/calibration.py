@@ -139,7 +139,7 @@ def _allan(source: DiveSource) -> list[Item]:
     except InputError as error:
         return [Missing("Allan deviation, as configured", str(error))]
     tau = np.geomspace(0.01, max(source.clock.end - source.clock.start, 1.0), 100)
-    note = "Falling: noise of the samples. Rising: walk of the bias. Calibrate noise measures both."
+    note = "Falling: noise of the samples. Rising: walk of the bias. `rovgraph calibrate noise` measures both."
     items: list[Item] = []
     for name, unit, density, walk in (
         ("accelerometer", "m/s²", noise.acc, noise.acc_walk),

@@ -1,6 +1,7 @@
 """Section on the dive itself: depth, attitude, velocities, altitude and sds against time, each with its band."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from rovgraph.report.colours import SERIES
 from rovgraph.report.motion import Series, axis_limits, bottom, lower_end, motion, span, unwrapped
 from rovgraph.report.pages.page import Item, Panel, Section, Trace, broken, extremes, line, packed
 from rovgraph.report.pages.source import DiveSource
-from rovgraph.report.pages.uncertainty import sd_notes, sd_panels
+from rovgraph.report.pages.uncertainty import sd_panels
 
 BOTTOM = "#8C6D46"
 STRETCHES = 500  # of a series; two panels stand side by side
@@ -33,8 +34,10 @@ def dive_section(source: DiveSource) -> Section:
         if known:
             items.append(_panel(source, title, label, known))
     items += [*_altitude(source), *sd_panels(source)]
-    lead = ["Bands hold one sd to each side. Drag across a plot to zoom all of them, double-click to zoom out."]
-    return Section("dive", "The dive", [*lead, *sd_notes(source)], items)
+    if len(items) % 2 and isinstance(items[-1], Panel):
+        items[-1] = replace(items[-1], wide=True)
+    lead = ["Bands hold one sd to each side. Drag across a plot to zoom all of them; a double click shows all again."]
+    return Section("dive", "The dive", lead, items)
 
 
 def _panel(source: DiveSource, title: str, label: str, shown: Sequence[Series]) -> Panel:
@@ -50,6 +53,8 @@ def _panel(source: DiveSource, title: str, label: str, shown: Sequence[Series]) 
             drawn.append(line("bottom", source.clock(ping[some]), depth[some], BOTTOM))
             spans.append(span(below[0], below[1], np.zeros_like(below[1]), 0.0))
     limits = axis_limits(spans)
+    if limits is not None and shown[0].name == "speed":
+        limits = 0.0, limits[1]
     return Panel(title, source.clock.label, label, drawn, wide=False, limits=limits, down=shown[0].name == "depth")
 
 

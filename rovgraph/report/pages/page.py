@@ -79,6 +79,7 @@ class Panel:
     limits : low, high of y at first; None = all
     key : name in files and configuration, in small print
     down : y grows downwards
+    ticks : the only values of y that there are
     ramp : colours from low to high with their two labels, beside the title
     """
 
@@ -97,12 +98,19 @@ class Panel:
     key: str = ""
     down: bool = False
     ramp: tuple[Sequence[str], str, str] | None = None
+    ticks: Sequence[float] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Data for ``page.js``."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
-        more = {"log": self.log, "names": [*self.names], "limits": self.limits, "down": self.down}
+        more = {
+            "log": self.log,
+            "names": [*self.names],
+            "limits": self.limits,
+            "down": self.down,
+            "ticks": [*self.ticks],
+        }
         return {**chosen, "levels": [*self.levels], "spans": spans, **more}
 
 

@@ -131,7 +131,7 @@ def dvl_section(source: DiveSource) -> Section:
     drawn = [_over_time(source, "bottom lock", time, lock, line_shape="hv")]
     seen = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom" if len(lock) else "There is no ping"
     note = f"{seen}; one that repeats the ping before it saw nothing. Shaded: silences."
-    items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans))
+    items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans, ticks=(0.0, 1.0)))
     items += beam_items(source, spans)
     items.append(_silences(time[lock == 1]))
     items += _merit(source, pings)
@@ -239,8 +239,9 @@ def _residuals_in_a_sentence(source: DiveSource) -> tuple[str, bool | None]:
     if not worse and not better:
         return "Every sensor's are as large as stated.", True
     parts = [
-        f"{len(some)} of {len(sensors)} sensors {what} ({', '.join(map(words, some))})"
-        for some, what in ((worse, "err more than stated, or for longer"), (better, "err less than stated"))
+        f"{len(some)} of {len(sensors)} sensors {'errs' if len(some) == 1 else 'err'} {what} "
+        f"({', '.join(map(words, some))})"
+        for some, what in ((worse, "more than stated, or for longer"), (better, "less than stated"))
         if some
     ]
     return "; ".join(parts) + ".", not worse
@@ -332,9 +333,9 @@ def clocks_section(source: DiveSource) -> Section:
     items: list[Item] = [PageTable("Clocks, rates and gaps", head, rows, note=note), *_periods(source)]
     gaps = {str(s): n["longest_gap_s"] for s, n in sensors.items() if n.get("longest_gap_s") is not None}
     worst = max(gaps, key=gaps.__getitem__, default="")
-    finding = f"The longest gap is one of {gaps[worst]:.3g} s, of {words(worst)}." if gaps else "What came when."
+    finding = f"The longest gap took {gaps[worst]:.3g} s ({words(worst)})." if gaps else "What came when."
     late = [e.get("sensor") for e in source.summary.get("alarms") or [] if e.get("kind") in ("clock", "check")]
-    doubt = f" The alarms doubt {', '.join(words(str(s)) for s in dict.fromkeys(late))}." if late else ""
+    doubt = f" An alarm names {', '.join(words(str(s)) for s in dict.fromkeys(late))}." if late else ""
     return Section("clocks", "Clocks and gaps", (), items, finding=finding + doubt, well=not late if gaps else None)
 
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pymap3d.rcurve import meridian, transverse
 
 from rovgraph.geometry import Array
-from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
+from rovgraph.report.colours import ESTIMATES, REJECTED, USED
 from rovgraph.report.pages.page import Missing, Panel, Trace, extremes, line, packed, points, spread
 from rovgraph.report.pages.source import KINDS, DiveSource, PageTrack
 
-ELLIPSES = 24
+ELLIPSES, ELLIPSE = 24, "#8A8A9A"
 SPACED = np.linspace(0.0, 2 * np.pi, 41)
 SILENT, MARK = "#B35900", "#6A3D9A"
 # of the sd from low to high, dark to light: readable for the colour-blind and in grey (viridis, its pale end left out)
@@ -28,11 +28,11 @@ def track_chart(source: DiveSource) -> Panel | Missing:
         return Missing("Track", "the trajectory holds no known position")
     coloured, ramp = _coloured(source)
     traces = [
-        *_lines(source),
-        *coloured,
-        *_silent(source),
-        *_fixes(source.residuals, source),
+        *_lines(source, without=source.main.kind if coloured else ""),
         *_ellipses(source.main),
+        *_fixes(source.residuals, source),
+        *_silent(source),
+        *coloured,
         *_ends(source),
         *_marks(source.frame("marks.csv", "name", "north", "east")),
     ]
@@ -61,6 +61,7 @@ def _coloured(source: DiveSource) -> tuple[list[Trace], tuple[Sequence[str], str
     low, high = float(known.min()), float(known.max())
     share = (np.where(np.isnan(sd[some]), low, sd[some]) - low) / max(high - low, 1e-9)
     step = np.clip((share * len(RAMP)).astype(int), 0, len(RAMP) - 1)[:-1]
+    digits = int(np.clip(1 - np.floor(np.log10(max(high, 1e-3))), 1, 3))
     drawn = []
     for k, colour in enumerate(RAMP):
         pieces = np.flatnonzero(step == k)
@@ -73,7 +74,7 @@ def _coloured(source: DiveSource) -> tuple[list[Trace], tuple[Sequence[str], str
             values[index < 0] = np.nan
         look = {"width": 3.5, "t": packed(columns["t"]), "value": packed(columns["sd"]), "showlegend": False}
         drawn.append(line(f"{track.name} {k}", columns["east"], columns["north"], colour, **look))
-    return drawn, (RAMP, f"{low:.2g} m", f"{high:.2g} m" if high < 10.0 else f"{high:.0f} m")
+    return drawn, (RAMP, *(f"{one:.{digits}f} m" for one in (low, high)))
 
 
 def _seen(source: DiveSource, track: PageTrack, sd: Array) -> dict[str, Array]:
@@ -118,10 +119,12 @@ def _thinned(track: PageTrack) -> NDArray[np.intp]:
     return extremes(track["north"], track["east"])
 
 
-def _lines(source: DiveSource) -> list[Trace]:
+def _lines(source: DiveSource, without: str) -> list[Trace]:
     dashes = {"smoothed": "solid", "filtered": "dash", "dead_reckoning": "dot"}
     drawn = []
     for kind, track in reversed(source.tracks.items()):
+        if kind == without:
+            continue
         some = _thinned(track)
         look: dict[str, Any] = {"dash": dashes[kind], "width": 1.3}
         look |= {} if kind == source.main.kind else {"visible": "legendonly"}
@@ -182,7 +185,7 @@ def _ellipses(track: PageTrack) -> list[Trace]:
     gap = np.full((len(some), 1), np.nan)
     north = np.hstack([track["north"][some, None] + c * a - s * b, gap]).ravel()
     east = np.hstack([track["east"][some, None] + s * a + c * b, gap]).ravel()
-    return [line("99 % ellipses", east, north, OTHER, width=0.9, hoverinfo="skip")]
+    return [line("99 % ellipses", east, north, ELLIPSE, width=0.9, hoverinfo="skip")]
 
 
 def _ends(source: DiveSource) -> list[Trace]:

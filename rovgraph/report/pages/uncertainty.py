@@ -127,8 +127,9 @@ def separation_section(source: DiveSource) -> Section:
     The smoother contains what the filter knew, so that the variance of their difference is P_f - P_s.
     """
     lead = [
+        *sd_notes(source),
         "Filtered minus smoothed, over its expected standard deviation. Nearly all of it should stay within ±3; "
-        "an excursion shows when the filter was surer than it should have been."
+        "an excursion shows when the filter was surer than it should have been.",
     ]
     title = "Separation of filtered and smoothed"
     if not {"filtered", "smoothed"} <= set(source.tracks):

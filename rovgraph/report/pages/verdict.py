@@ -113,7 +113,7 @@ def opening(source: DiveSource) -> Opening:
     return Opening(
         chart=track_chart(source),
         verdict=str(summary.get("verdict", "unknown")),
-        sentences=[how_good(source), *limits(source)],
+        sentences=[how_good(source), *_why(source), *limits(source)],
         facts=_facts(source),
         numbers=_five(source),
         counts=[f"{n} {one if n == 1 else many}" for n, (one, many) in zip(lengths, named, strict=True) if n],
@@ -137,6 +137,14 @@ def verdict_section(source: DiveSource) -> Section:
     lead = [*notes, *track_notes(source)]
     known = {name: lines for name, lines in lists.items() if lines}
     return Section("verdict", "Alarms and assumptions", lead, [_numbers(source)], known)
+
+
+def _why(source: DiveSource) -> list[str]:
+    """The first alarm without its remedy, of a dive that can be used with care."""
+    alarms = source.summary.get("alarms") or []
+    if source.summary.get("verdict") != "doubtful" or not alarms:
+        return []
+    return [f"Why: {str(alarms[0].get('text', '')).partition('; ')[0]}."]
 
 
 def _facts(source: DiveSource) -> list[str]:

@@ -42,6 +42,10 @@
     const digits = Math.min(Math.max(3 - Math.ceil(Math.log10(span)), 0), 9);
     return Math.abs(v) < span / 1000 ? "0" : v.toFixed(digits).replace("-", "−");
   };
+  const plusMinus = (v, sd) => { // two digits of the sd
+    const digits = Math.min(Math.max(1 - Math.floor(Math.log10(sd)), 0), 9);
+    return `${Math.abs(v) < sd / 1000 ? "0" : v.toFixed(digits).replace("-", "−")} ± ${sd.toFixed(digits)}`;
+  };
   const spanOf = (axis) => (axis.type === "log" ? NaN : Math.abs(axis.range[1] - axis.range[0]));
   const unitOf = (label) => (/\[(.+)\]/.exec(label) || ["", ""])[1];
   const narrow = () => innerWidth < 700;
@@ -50,13 +54,18 @@
   // ---- drawing -------------------------------------------------------------------------------
   const axis = (title, log, ticks) => ({
     title: { text: title, font: { size: 13 }, standoff: 8 }, automargin: true, zeroline: false, linecolor: "#888",
-    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks,
-    exponentformat: log ? "power" : "none", ...(log ? { dtick: 1 } : {}),
+    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks, exponentformat: "none",
   });
-  const spansDecade = (series, key) => {
+  // Numbers on a logarithmic axis: powers of ten over many decades, 1 2 5 over a few, all digits within one.
+  const logTicks = (series, key) => {
     let low = Infinity, high = 0;
     for (const s of series) for (const v of s[key]) if (v > 0) { low = Math.min(low, v); high = Math.max(high, v); }
-    return high > 20 * low;
+    if (!(high > 0)) return {};
+    const decades = Math.log10(high / low), digits = decades > 3 ? [1] : decades > 0.9 ? [1, 2, 5] : [1, 2, 3, 4, 5, 6, 7, 8, 9];
+    const tickvals = [];
+    for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k++) for (const d of digits) tickvals.push(+`${d}e${k}`);
+    const told = (v) => (v >= 1e-3 && v < 1e5 ? String(v) : v.toExponential(0).replace(/^1e\+?(-?\d+)$/, "10<sup>$1</sup>"));
+    return { tickvals, ticktext: tickvals.map(told), tickmode: "array" };
   };
   const layoutOf = (panel, series) => {
     const plain = (v) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: v, y1: v, line: { color: "#666", width: 1, dash: "dot" } });
@@ -69,7 +78,8 @@
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
-    for (const key of panel.log) if (!spansDecade(series, key)) layout[`${key}axis`].dtick = "D1"; // else it has no number
+    for (const key of panel.log) Object.assign(layout[`${key}axis`], logTicks(series, key));
+    if (panel.ticks.length) Object.assign(layout.yaxis, { tickvals: panel.ticks });
     if (panel.limits) layout.yaxis.range = panel.down ? [...panel.limits].reverse() : [...panel.limits];
     else if (panel.down) layout.yaxis.autorange = "reversed";
     if (panel.limits && panel.y.startsWith("heading [") && panel.limits[1] - panel.limits[0] > 220)
@@ -77,10 +87,10 @@
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
     if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
       range: [panel.names.length + 0.7, 0.3] });
-    if (panel.names.length && panel.log.includes("x")) layout.xaxis.dtick = "D2"; // 2 and 5 too: errors span a decade or two
     if (panel.kind === "map") {
       Object.assign(layout.yaxis, { scaleanchor: "x", scaleratio: 1 });
-      if (data.origin) graticule(layout, null);
+      if (narrow()) { Object.assign(layout, { showlegend: false }); layout.xaxis.nticks = 5; layout.yaxis.nticks = 6; }
+      if (data.origin && !narrow()) graticule(layout, null);
     }
     return layout;
   };
@@ -97,13 +107,19 @@
     return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays, name: plain, label: trace.name };
   };
 
-  // A line with an sd has a band of so many of them to each side.
+  // A line with an sd has a band of so many of them to each side: a closed shape for each part without a gap.
   const withBand = (s) => {
     if (!s.sd) return [s];
-    const edge = (sign) => ({ ...s, y: s.y.map((v, i) => v + sign * s.band * s.sd[i]), line: { ...s.line, width: 0 }, sd: undefined,
-      showlegend: false, legendgroup: s.label, hoverinfo: "skip", hovertemplate: undefined, quiet: true,
-      label: `${s.label} ${sign < 0 ? "−" : "+"} ${s.band} sd` });
-    return [edge(-1), { ...edge(1), fill: "tonexty", fillcolor: s.line.color + "2e" }, { ...s, legendgroup: s.label }];
+    const x = [], y = [], known = (i) => Number.isFinite(s.y[i]) && Number.isFinite(s.sd[i]);
+    for (let from = 0, to; from < s.x.length; from = to + 1) {
+      for (to = from; to < s.x.length && known(to); to++) { x.push(s.x[to]); y.push(s.y[to] + s.band * s.sd[to]); }
+      for (let i = to - 1; i >= from; i--) { x.push(s.x[i]); y.push(s.y[i] - s.band * s.sd[i]); }
+      if (to > from) { x.push(NaN); y.push(NaN); }
+    }
+    const band = { type: "scatter", mode: "lines", name: s.name, x, y, line: { width: 0, color: s.line.color }, fill: "toself",
+      fillcolor: s.line.color + "2e", showlegend: false, legendgroup: s.label, hoverinfo: "skip", quiet: true,
+      label: `${s.label} ± ${s.band} sd` };
+    return [band, { ...s, legendgroup: s.label }];
   };
 
   const draw = async (figure) => {
@@ -118,7 +134,7 @@
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoom2d", "zoomIn2d", "zoomOut2d"], modeBarButtonsToAdd: [exportButton(entry)] };
     // an axis shows only where something stands over it
-    const degrees = panel.kind === "map" && data.origin ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
+    const degrees = panel.kind === "map" && data.origin && !narrow() ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
     await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel, series), options);
     plot.querySelectorAll(".modebar-btn").forEach((b) => { b.setAttribute("role", "button"); b.setAttribute("aria-label", b.dataset.title || "tool"); });
     entry.layer = plot.appendChild(document.createElementNS(svg, "svg"));
@@ -155,7 +171,7 @@
   // ---- zoom of all time axes together --------------------------------------------------------
   let following = false;
   const relayout = (entry, change) => {
-    if (entry.panel.kind === "map") { place(entry); if (data.origin && !following) regrid(entry); }
+    if (entry.panel.kind === "map") { place(entry); if (data.origin && !following && entry.plot._fullLayout.xaxis2) regrid(entry); }
     if (following || entry.panel.kind !== "time") return mark(entry);
     if (change["xaxis.autorange"]) return zoom(null);
     if ("xaxis.range[0]" in change) return zoom([change["xaxis.range[0]"], change["xaxis.range[1]"]]);
@@ -193,7 +209,7 @@
     const common = { overlaying: "x", showgrid: true, gridcolor: "#b5c9d6", griddash: "dot", tickfont: { size: 10, color: "#3d5a6c" }, zeroline: false, tickmode: "array", automargin: true };
     layout.xaxis2 = { ...common, side: "top", matches: "x", ...lines(x, o.lon, o.lon_m, "EW", innerWidth < 700 ? 2 : 5) };
     layout.yaxis2 = { ...common, overlaying: "y", side: "right", matches: "y", ...lines(y, o.lat, o.lat_m, "NS", 6) };
-    layout.legend = { orientation: "h", y: narrow() ? -0.2 : -0.1, yanchor: "top", x: 0, font: { size: narrow() ? 11 : 12 } };
+    layout.legend = { orientation: "h", y: -0.1, yanchor: "top", x: 0, font: { size: 12 } };
   };
   const regrid = async (entry) => {
     const full = entry.plot._fullLayout, layout = {};
@@ -233,11 +249,12 @@
     const named = (s) => (/\d$/.test(s.label) ? `${s.label}:` : s.label); // a number beside a number
     const near = (xaxis.range[1] - xaxis.range[0]) / 200; // under the mouse; a line is known between its points
     const here = (s) => s.x.length && (s.mode !== "markers" || Math.abs(s.x[nearest(s.x, now)] - now) <= near);
-    const log = entry.panel.log.includes("y"), span = log ? NaN : spanOf(yaxis), unit = unitOf(entry.panel.y);
+    const log = entry.panel.log.includes("y") || entry.panel.ticks.length, span = log ? NaN : spanOf(yaxis), unit = unitOf(entry.panel.y);
     const tell = (s) => {
       const i = nearest(s.x, now), value = (s.value || s.y)[i], sd = s.sd ? s.sd[i] : NaN;
       if (!Number.isFinite(value)) return `${named(s)} unknown`;
-      return `${named(s)} ${number(value, s.value ? NaN : span)}${Number.isFinite(sd) ? ` ± ${+sd.toPrecision(2)}` : ""}${unit === "°" ? "" : unit && " "}${unit}`;
+      const shown = sd > 0 ? plusMinus(value, sd) : number(value, s.value ? NaN : span);
+      return `${named(s)} ${shown}${unit === "°" ? "" : unit && " "}${unit}`;
     };
     const told = entry.series.filter((s) => !s.quiet && s.visible !== "legendonly" && here(s)).map(tell);
     entry.readout.textContent = `at ${+now.toFixed(data.clock.unit === "s" ? 1 : 2)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
@@ -295,7 +312,7 @@
     let text = `${now.toFixed(unit === "s" ? 1 : 2)} ${unit}`;
     if (cursor) {
       const v = vehicle(now), heading = (((v.yaw * 180) / Math.PI) % 360 + 360) % 360;
-      text += ` · north ${metres(v.north)} m, east ${metres(v.east)} m, depth ${metres(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
+      text += ` · ${narrow() ? "N" : "north"} ${metres(v.north)} m, ${narrow() ? "E" : "east"} ${metres(v.east)} m, ${narrow() ? "" : "depth "}${metres(v.down)} m ${narrow() ? "deep · " : "· heading "}${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
       if (!narrow()) text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
       if (data.origin && !narrow()) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
     }
