@@ -171,7 +171,7 @@ def _histories(source: DiveSource) -> list[Item]:
             spans.append(span(time, value, sd, BAND if kind == source.main.kind else 0.0))
         if drawn:
             name, key, unit = words(str(variable)), str(variable), unit.replace("deg", "°").replace("s2", "s²")
-            label = name + ("" if unit in ("", "1") else f" [{unit}]")
+            label = f"estimate [{unit or 1}]"
             labels, limits = (source.clock.label, label), axis_limits(spans, 0.0)
             title, note = name[:1].upper() + name[1:], "Bands: two sd."
             items.append(Panel(title, *labels, drawn, note=note, wide=False, key=key, limits=limits))

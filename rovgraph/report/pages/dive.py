@@ -36,7 +36,7 @@ def dive_section(source: DiveSource) -> Section:
     items += [*_altitude(source), *sd_panels(source)]
     if len(items) % 2 and isinstance(items[-1], Panel):
         items[-1] = replace(items[-1], wide=True)
-    lead = ["Bands hold one sd to each side. Drag across a plot to zoom all of them; a double click shows all again."]
+    lead = ["Bands hold one standard deviation (sd) to each side. Zooming one plot zooms all of them."]
     return Section("dive", "The dive", lead, items)
 
 

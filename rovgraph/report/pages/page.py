@@ -104,14 +104,9 @@ class Panel:
         """Data for ``page.js``."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
-        more = {
-            "log": self.log,
-            "names": [*self.names],
-            "limits": self.limits,
-            "down": self.down,
-            "ticks": [*self.ticks],
-        }
-        return {**chosen, "levels": [*self.levels], "spans": spans, **more}
+        more = {"log": self.log, "names": [*self.names], "ticks": [*self.ticks]}
+        shown = {"limits": self.limits, "down": self.down}
+        return {**chosen, "levels": [*self.levels], "spans": spans, **more, **shown}
 
 
 @dataclass(frozen=True)
@@ -296,7 +291,6 @@ TERMS = {
     "nees": "normalised estimation error squared: squared error over its variance; 1 per dimension on the average",
     "separation": "filtered minus smoothed, over the sd that this difference should have",
     "considered": "held at its mean, with its uncertainty in the sd of everything else (Schmidt's consider variable)",
-    "sd": "standard deviation",
 }  # words of the field that a reader may not know
 
 

@@ -64,6 +64,11 @@
     const decades = Math.log10(high / low), digits = decades > 3 ? [1] : decades > 0.9 ? [1, 2, 5] : [1, 2, 3, 4, 5, 6, 7, 8, 9];
     const tickvals = [];
     for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k++) for (const d of digits) tickvals.push(+`${d}e${k}`);
+    if (tickvals.filter((v) => v >= low && v <= high).length < 2) { // hardly any span: round steps
+      const power = 10 ** Math.floor(Math.log10((high - low) / 2)), step = [5, 2, 1].map((d) => d * power).find((d) => 2 * d <= high - low) || power;
+      tickvals.length = 0;
+      for (let k = Math.ceil(low / step); k * step <= high; k++) tickvals.push(+(k * step).toPrecision(6));
+    }
     const told = (v) => (v >= 1e-3 && v < 1e5 ? String(v) : v.toExponential(0).replace(/^1e\+?(-?\d+)$/, "10<sup>$1</sup>"));
     return { tickvals, ticktext: tickvals.map(told), tickmode: "array" };
   };
