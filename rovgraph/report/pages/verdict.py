@@ -165,13 +165,13 @@ def _five(source: DiveSource) -> dict[str, str]:
     summary, track = source.summary, source.main
     down = track["down"][np.isfinite(track["down"])]
     distance = summary.get("distance_m")
-    depth = f"{_shortest(float(down.min()))} to {_shortest(float(down.max()))} m" if len(down) else "unknown"
+    ends = [_shortest(depth) for depth in (down.min(), down.max())] if len(down) else ["unknown"]
     heading = float(np.rad2deg(track["yaw_sd"][-1]))
     wrong = summary.get("verdict") == "wrong"  # the sds are those of a dive that did not happen
     return {
         "duration": duration(summary.get("duration_s")),
         "distance": f"{distance:.4g} m" if isinstance(distance, int | float) else "unknown",
-        "depth": depth,
+        "depth": " to ".join(dict.fromkeys(ends)) + (" m" if len(down) else ""),
         "position sd at the end": "not valid" if wrong else _metres(track.horizontal_sd[-1]),
         "heading sd at the end": "not valid" if wrong else f"{heading:.2g}°" if np.isfinite(heading) else "unknown",
     }

@@ -135,9 +135,9 @@
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
     if (panel.names.length && panel.kind !== "time") plot.style.height = `${110 + 22 * panel.names.length}px`;
-    const options = { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover", scrollZoom: false,
+    const options = { responsive: true, displaylogo: false, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover", scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoom2d", "zoomIn2d", "zoomOut2d"], modeBarButtonsToAdd: [exportButton(entry)] };
+      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoom2d", "zoomIn2d", "zoomOut2d", "sendChartToCloud"], modeBarButtonsToAdd: [exportButton(entry)] };
     // an axis shows only where something stands over it
     const degrees = panel.kind === "map" && data.origin && !narrow() ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
     await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel, series), options);
