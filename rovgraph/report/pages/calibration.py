@@ -51,11 +51,11 @@ def calibration_section(source: DiveSource) -> Section:
 
 def _in_a_sentence(table: pd.DataFrame | None) -> tuple[str, bool | None]:
     """What the dive showed of its instruments, and whether anything moved far."""
-    if table is None or table.empty or "verdict" not in table:
+    if table is None or table.empty or not {"verdict", "moved_in_prior_sd"} <= set(table):
         return "What the dive showed of its instruments.", None
     estimated = table[table["estimated"].astype(str) == "True"] if "estimated" in table else table
     seen = int((estimated["verdict"] == "observable").sum())
-    moved = pd.to_numeric(table.get("moved_in_prior_sd"), errors="coerce")
+    moved = pd.to_numeric(table["moved_in_prior_sd"], errors="coerce")
     far = [words(str(label)) for label in table.loc[np.abs(moved) > MOVED, "label"]]
     sentence = f"The dive shows {seen} of {len(estimated)} variables that were estimated"
     return f"{sentence}; {', '.join(far)} moved far." if far else f"{sentence}; none moved far.", not far

@@ -74,7 +74,7 @@ def _coloured(source: DiveSource) -> tuple[list[Trace], tuple[Sequence[str], str
             values[index < 0] = np.nan
         look = {"width": 3.5, "t": packed(columns["t"]), "value": packed(columns["sd"]), "showlegend": False}
         drawn.append(line(f"{track.name} {k}", columns["east"], columns["north"], colour, **look))
-    return drawn, (RAMP, *(f"{one:.{digits}f} m" for one in (low, high)))
+    return drawn, (RAMP, f"{low:.{digits}f} m", f"{high:.{digits}f} m")
 
 
 def _seen(source: DiveSource, track: PageTrack, sd: Array) -> dict[str, Array]:
