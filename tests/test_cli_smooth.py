@@ -134,7 +134,12 @@ def test_a_log_without_configuration_is_smoothed_and_says_what_it_assumed(tmp_pa
     columns = [c for c in short if not c.startswith("mag_")]
     log = save(short[columns], tmp_path / "log.csv")
     assert run(monkeypatch, "smooth", log, "-o", tmp_path / "out", *FAST) == 0
-    assert "assumed: heading from dvl_heading" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "error of the heading, which rests on dvl_compass_offset" in said and "more (--verbose lists them)" in said
+    assert 2 <= said.count("assumed: ") <= 4
+    assert run(monkeypatch, "smooth", log, "-o", tmp_path / "all", "--verbose", *FAST) == 0
+    said = capsys.readouterr().out
+    assert "assumed: heading from dvl_heading" in said and "(--verbose" not in said
 
 
 @pytest.mark.parametrize("which", ["smoothed", "filtered"])

@@ -13,7 +13,7 @@ import rovgraph as rg
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "data" / "falcon"
 LIVE = {"width": 1280, "height": 860}
-REPORT = {"width": 1280, "height": 1640}  # verdict and track
+REPORT = {"width": 1280, "height": 1640}  # the first screen and the dive
 COLOURS = 64
 LEAST_COLOURS = 200  # an empty page, or one of plain text alone, has fewer
 
@@ -52,11 +52,10 @@ def take(page, path: Path) -> None:
     shown.quantize(COLOURS).save(path, optimize=True)
 
 
-def test_the_report_begins_with_verdict_and_track(browser, pictures, tmp_path, log, config):
+def test_the_report_begins_with_track_verdict_and_dive(browser, pictures, tmp_path, log, config):
     rg.smooth(log, config).save(tmp_path / "dive", figures=False)
     page = browser.new_context(viewport=REPORT, offline=True).new_page()
     page.goto((tmp_path / "dive" / "report.html").as_uri())
-    page.evaluate("rovgraph.drawAll()")
     take(page, pictures / "report.png")
 
 

@@ -19,11 +19,10 @@ from rovgraph.report.pages.source import PageTrack
 from rovgraph.report.pages.uncertainty import falls, separation
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & <b>δύτης 潜水</b>"
-LIMIT = 6_000_000  # bytes of a page
+LIMIT = 4_000_000  # bytes of a page
 SECTIONS = [
+    "dive",
     "verdict",
-    "track",
-    "uncertainty",
     "separation",
     "dvl",
     "residuals",
@@ -94,6 +93,90 @@ def test_the_page_has_its_sections_in_order_and_is_small(folder):
     html = (folder / "report.html").read_text()
     assert re.findall(r'<section id="(\w+)"', html) == SECTIONS
     assert len(html.encode()) < LIMIT
+
+
+def test_the_first_screen_says_the_verdict_in_its_colour_and_five_numbers(folder, own):
+    html = (folder / "report.html").read_text()
+    opening = html[html.index('<div class="opening">') : html.index("<section")]
+    assert '<div class="verdict trusted"><strong>Trusted</strong>' in opening
+    numbers = re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", opening)
+    assert [name for name, _ in numbers] == [
+        "duration",
+        "distance",
+        "depth",
+        "position sd at the end",
+        "heading sd at the end",
+    ]
+    assert numbers[0][1] == "1 min 30 s" and all(value[0].isdigit() for _, value in numbers)
+    summary_with(own, verdict="wrong", origin={"lat_deg": -33.5, "lon_deg": 151.25})
+    html = page_of(own)
+    assert '<div class="verdict wrong">' in html and html.count("not valid</dd>") == 2
+    assert "33.5000° S, 151.2500° E" in html
+
+
+def test_the_track_has_the_colours_of_its_sd_and_one_without_an_sd_is_a_line(own):
+    chart = panels_of(page_of(own))["Track, coloured by its sd"]
+    coloured = [trace for trace in chart["traces"] if "value" in trace]
+    assert len({trace["line"]["color"] for trace in coloured}) == len(coloured) > 3
+    sd = np.concatenate([unpacked(trace["value"]) for trace in coloured])
+    table = pd.read_csv(own / "trajectory_smoothed.csv")
+    assert np.nanmax(sd) == pytest.approx(np.hypot(table["north_sd"], table["east_sd"]).max(), rel=0.3)
+
+    def forget(table):
+        table[["north_sd", "east_sd"]] = np.nan
+
+    with_track(own, forget)
+    assert [trace["name"] for trace in panels_of(page_of(own))["Track"]["traces"]].count("smoothed") == 1
+
+
+def test_the_dive_is_shown_with_its_sds_and_with_the_bottom_where_it_was_measured(own):
+    panels = panels_of(page_of(own))
+    assert "Altitude over the bottom" not in panels
+    depth, attitude = panels["Depth"], panels["Roll and pitch"]
+    assert depth["down"] and [t["name"] for t in depth["traces"]] == ["depth"]
+    assert all(t["band"] == 1 and (unpacked(t["sd"]) > 0).all() for t in [*depth["traces"], *attitude["traces"]])
+    pings = pd.read_csv(own / "dvl.csv")
+    pings["altitude"] = np.where(pings["lock"] == 1, 3.0, np.nan)
+    pings.to_csv(own / "dvl.csv", index=False)
+    panels = panels_of(page_of(own))
+    assert "Altitude over the bottom" in panels
+    low, high = panels["Depth"]["limits"]
+    assert high - low > 3.0
+    line_, bottom = panels["Depth"]["traces"]
+    assert np.nanmedian(unpacked(bottom["y"])) == pytest.approx(np.nanmedian(unpacked(line_["y"])) + 3.0, abs=0.2)
+
+
+def test_a_start_that_is_hardly_known_does_not_set_the_scale(own):
+    before = panels_of(page_of(own))["Speed over ground"]["limits"]
+
+    def spoil(table):
+        table.loc[:1, ["v_north", "v_north_sd"]] = 40.0
+
+    with_track(own, spoil)
+    assert panels_of(page_of(own))["Speed over ground"]["limits"] == pytest.approx(before, rel=0.02)
+
+
+def test_folded_parts_say_whether_they_are_well(own):
+    def finding(html, key):
+        part = html[html.index(f'<section id="{key}"') :]
+        return re.search(r'<span class="finding (\w*)">(.*?)</span>', part, re.DOTALL).groups()
+
+    summary_with(own, alarms=[], advice=[])
+    html = page_of(own)
+    assert finding(html, "residuals") == ("well", "Every sensor&#39;s are as large as stated.")
+    assert finding(html, "dvl")[1].startswith("77.5 % of 503 pings saw the bottom")
+    alarm = {"kind": "lasting", "sensor": "dvl", "severity": "doubtful", "text": "dvl: x; y"}
+    summary_with(own, alarms=[alarm], advice=[{"kind": "too small", "sensor": "depth", "text": "z"}])
+    state, sentence = finding(page_of(own), "residuals")
+    assert state == "care" and "1 of 4 sensors errs more than stated, or for longer (DVL)" in sentence
+    assert "1 of 4 sensors errs less than stated (depth)" in sentence
+
+
+def test_terms_of_the_field_are_explained_once_in_each_text(folder):
+    html = (folder / "report.html").read_text()
+    assert re.search(r'<abbr title="filtered minus smoothed[^"]*">Separation</abbr>', html)
+    section = Section("a", "A", ["NEES is NEES <b>", "considered"])
+    assert render("x", [section]).count("<abbr") == 2
 
 
 def test_the_page_loads_nothing(folder):
@@ -260,14 +343,14 @@ def test_shares_of_valid_pings_stay_few_over_a_long_dive_and_know_where_there_is
 
 def test_every_compass_is_shown_with_the_curve_that_was_estimated(own):
     """The vehicle's own heading, too."""
-    assert "dvl_heading: deviation" in page_of(own)
+    assert "DVL heading: deviation" in page_of(own)
     for name in ("residuals.csv", "calibration.csv"):
         text = (own / name).read_text()
         (own / name).write_text(
             text.replace("dvl_heading", "vehicle_heading").replace("dvl_compass", "vehicle_compass")
         )
     html = page_of(own)
-    assert "vehicle_heading: deviation" in html
+    assert "vehicle heading: deviation" in html
     assert "No deviation curve was estimated" not in html
 
 
@@ -289,7 +372,7 @@ def test_without_a_split_a_start_that_is_hardly_known_is_what_limits_a_track(own
     without_sources(own)
     assert "the position at the start, known" not in page_of(own)
     with_track(own, widen)
-    assert "What limits it: the position at the start, known to 30 m" in page_of(own)
+    assert "<strong>What limits it:</strong> the position at the start, known to 30 m" in page_of(own)
 
 
 def test_without_a_split_a_dive_without_a_dvl_is_not_limited_by_its_dvl(own):

@@ -434,6 +434,35 @@ def test_tables_say_value_spread_and_prior(written, dive):
         assert part in text
 
 
+def test_constants_held_at_0_are_counted_and_named_where_that_is_asked_for(dive):
+    entries = [
+        CalibrationEstimate(name, "1", "", False, 0.0, 0.0, 0.0, 0.0, "") for name in ("acc_scale_x", "dvl_scale")
+    ]
+    console = Console(width=100, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    estimates = [replace(dive[0][0], calibration=[*dive[0][0].calibration, *entries])]
+    console.print(calibration_table(estimates))
+    text = console.export_text()
+    assert "constants are held at 0 (--verbose lists them)" in text and "acc_scale_x" not in text
+    console.print(calibration_table(estimates, verbose=True))
+    assert "acc_scale_x, dvl_scale" in " ".join(console.export_text().split())
+
+
+def test_the_assumptions_that_could_move_the_track_come_first_and_are_three():
+    from rovgraph.report.assumptions import leading
+
+    lines = [
+        "heading from ahrs",
+        "left out 3 of dvl: no bottom lock",
+        "nothing shows a constant error of the depth, which rests on depth_offset, sd 0.2 m",
+        "no fix shows a constant error of the DVL's scale, which rests on dvl_scale, sd 0.02",
+        "nothing checks the compass, and no calibration of it is stated: x",
+    ]
+    first, others = leading(lines)
+    assert first == [lines[4], lines[3], lines[2]]
+    assert others == [lines[0], lines[1]]
+    assert leading([]) == ([], [])
+
+
 @pytest.mark.parametrize(
     ("value", "sd", "text"),
     [
@@ -570,9 +599,9 @@ def test_figures_leave_matplotlib_as_it_was(dive, tmp_path):
 
 
 def test_wrapped_heading_is_broken():
-    from rovgraph.report.style import broken
+    from rovgraph.report.motion import unwrapped
 
-    time, angle, sd = broken(np.arange(4.0), np.array([350.0, 359.0, 2.0, 5.0]), np.ones(4))
+    time, angle, sd = unwrapped(np.arange(4.0), np.array([350.0, 359.0, 2.0, 5.0]), np.ones(4))
     np.testing.assert_array_equal(angle, [350, 359, np.nan, 2, 5])
     assert len(time) == len(sd) == 5 and np.isnan(time[2])
 

@@ -135,7 +135,7 @@ def demo(
         done = rg.demo(out, force, progress)
     track = done.results / "trajectory_smoothed.csv"
     typer.echo(f"$ rovgraph smooth {out / 'log.csv'} --config {out / 'config.yaml'} --out {done.results}")
-    show_result(done.result, done.summary, done.results)
+    show_result(done.result, done.summary, done.results, verbose=False)
     typer.echo(f"\n$ rovgraph evaluate {track} {out / 'truth.csv'}")
     show_metrics(done.metrics, "smoothed track against the truth")
     typer.echo(f"""

@@ -47,6 +47,7 @@ def smooth(
     ] = None,
     page: Annotated[bool, typer.Option("--page/--no-page", help="make report.html")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="print all assumptions and constants")] = False,
     choose: Choose = None,
     shift: Shift = None,
     times: Times = None,
@@ -74,14 +75,15 @@ def smooth(
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
     summary = result.save(out, force, figures, page, export or [])
-    show_result(result, summary, out)
+    show_result(result, summary, out, verbose)
     if strict and result.verdict != "trusted":
         raise typer.Exit(NOT_TRUSTED)
 
 
-def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
-    """Print verdict, alarms, tables, assumptions and advice."""
+def show_result(result: "Result", summary: dict[str, Any], out: Path, verbose: bool) -> None:
+    """Print verdict, alarms, tables, assumptions and advice; all assumptions and names where ``verbose``."""
     from rovgraph.cli.console import console, say
+    from rovgraph.report.assumptions import leading
     from rovgraph.report.tables import calibration_table, summary_table
 
     shown = console()
@@ -89,9 +91,12 @@ def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
     for alarm in result.alarms:
         say(shown, f"{alarm.severity}: {alarm.text}")
     shown.print(summary_table(result.dive.estimates, summary))
-    shown.print(calibration_table(result.dive.estimates))
-    for line in result.assumptions:
+    shown.print(calibration_table(result.dive.estimates, verbose))
+    first, others = leading(result.assumptions)
+    for line in [*first, *(others if verbose else [])]:
         say(shown, f"assumed: {line}")
+    if others and not verbose:
+        say(shown, f"assumed: {len(others)} more (--verbose lists them)")
     for advice in result.advice:
         say(shown, f"advice: {advice.text}")
     page = " (open report.html)" if (out / "report.html").exists() else ""

@@ -24,11 +24,11 @@ from rovgraph.log import Log
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.report.colours import PRIOR, REJECTED, UNUSED, USED
+from rovgraph.report.motion import Series, axis_limits, bottom, lower_end, motion, span, unwrapped, within
 from rovgraph.report.results import CHI2_99, ellipse_axes, history_labels, main_first
 from rovgraph.report.style import (
     WIDTH,
     TimeAxis,
-    broken,
     legend_below,
     line_of,
     name_lowest,
@@ -156,26 +156,19 @@ SOURCES: dict[str, tuple[str, dict[str, Any]]] = {
 BOTTOM: dict[str, Any] = {"color": "#8C6D46", "linewidth": 0.9, "zorder": 1}
 MOST_SAMPLES = 1500  # of a heading source
 DENSE = 2000  # epochs from which lines are drawn thinner
-USUAL = (1.0, 99.0)  # percentiles of value ± 2 sd that an axis shows; a poorly known start would flatten the dive
+BAND = 2.0  # sds
 
 
 def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
     """Velocity north, east, down and speed over ground, with ±2 sd."""
     figure = new_figure(7.2)
-    panels: list[Axes] = list(figure.subplots(4, 1, sharex=True))
+    names = ("north", "east", "down", "speed")
+    panels: list[Axes] = list(figure.subplots(len(names), 1, sharex=True))
     clock = TimeAxis.of(estimates[0])
-    spans: list[list[tuple[float, float]]] = [[] for _ in panels]
-    for estimate in estimates:
-        track = estimate.trajectory
-        speed, speed_sd = _speed(track)
-        values, sds = np.column_stack([track.v_n, speed]), np.column_stack([track.v_sd, speed_sd])
-        some = thin(len(track))
-        for axes, span, value, sd in zip(panels, spans, values[some].T, sds[some].T, strict=True):
-            _line_and_band(axes, clock(track.time[some]), value, sd, estimate.kind)
-            span.append(_span(value, sd))
-    for axes, name, span in zip(panels, ("north", "east", "down", "speed"), spans, strict=True):
+    motions = [(estimate, _motion(estimate.trajectory)) for estimate in estimates]
+    for axes, name in zip(panels, names, strict=True):
+        _series(axes, clock, [(estimate, found[name]) for estimate, found in motions])
         axes.set_ylabel(f"{name} [m/s]")
-        _scale(axes, span)
     panels[3].set_ylim(bottom=0.0)
     panels[0].set_title("velocity over ground, bands ±2 sd", loc="left")
     clock.name_axis(panels[3])
@@ -184,30 +177,48 @@ def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
     return figure
 
 
+def _motion(track: Trajectory, low: float = 0.0) -> dict[str, Series]:
+    """The series of a trajectory."""
+    columns = {**track.columns(), "cov_v_north_east": track.cov_v[:, 0, 1]}
+    return motion(columns.__getitem__, low)
+
+
+def _series(
+    axes: Axes,
+    clock: TimeAxis,
+    series: Sequence[tuple[Estimate, Series]],
+    more: Sequence[tuple[float, float]] = (),
+) -> None:
+    """A line and a band of each estimate, and the axis that shows them and ``more``."""
+    spans = [*more]
+    for estimate, one in series:
+        time, some = estimate.trajectory.time, thin(len(estimate.trajectory))
+        _line_and_band(axes, clock(time[some]), one.value[some], one.sd[some], estimate.kind)
+        spans.append(span(time, one.value, one.sd, BAND))
+    limits = axis_limits(spans)
+    if limits is not None:
+        axes.set_ylim(*limits)
+
+
 def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
     """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
     main, clock = estimates[0], TimeAxis.of(estimates[0])
-    bottom = "dvl_altitude" in log
-    figure = new_figure(4.8 if bottom else 3.6)
-    panels: list[Axes] = list(figure.subplots(1 + bottom, 1, sharex=True, squeeze=False)[:, 0])
-    spans = []
-    for estimate in estimates:
-        track, some = estimate.trajectory, thin(len(estimate.trajectory))
-        depth, sd = track.p_n[some, 2], track.p_sd[some, 2]
-        _line_and_band(panels[0], clock(track.time[some]), depth, sd, estimate.kind)
-        spans.append(_span(depth, sd))
+    has_bottom = "dvl_altitude" in log
+    figure = new_figure(4.8 if has_bottom else 3.6)
+    panels: list[Axes] = list(figure.subplots(1 + has_bottom, 1, sharex=True, squeeze=False)[:, 0])
     panels[0].set_ylabel("depth [m]")
-    panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if bottom else ""), loc="left")
-    if bottom:
-        stream = log["dvl_altitude"].take(thin(len(log["dvl_altitude"])))
+    panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if has_bottom else ""), loc="left")
+    more = []
+    if has_bottom:
+        stream, track = log["dvl_altitude"].take(thin(len(log["dvl_altitude"]))), main.trajectory
         altitude, time = stream["dvl_altitude"], clock(stream.time)
-        below = main.trajectory.at(stream.time).p_n[:, 2] + altitude
+        below = bottom(track.time, track.p_n[:, 2], stream.time, altitude)
         panels[0].plot(time, below, label="bottom", **BOTTOM)
-        spans.append(_span(below, np.zeros_like(below)))
+        more.append(span(stream.time, below, np.zeros_like(below), BAND))
         panels[1].plot(time, altitude, **BOTTOM)
         panels[1].set_ylabel("altitude [m]")
         panels[1].set_ylim(bottom=0.0)
-    _scale(panels[0], spans)
+    _series(panels[0], clock, [(estimate, _motion(estimate.trajectory)["depth"]) for estimate in estimates], more)
     panels[0].invert_yaxis()
     clock.name_axis(panels[-1])
     figure.align_ylabels()
@@ -222,15 +233,15 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     heights = (1.0, 1.0, 1.6, 1.1) if samples else (1.0, 1.0, 1.6)
     figure = new_figure(1.0 + 1.6 * sum(heights))
     panels: list[Axes] = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
-    low = _lower_end(main.trajectory)
-    for estimate in estimates:
-        _draw_attitude(panels, estimate, clock, low)
-    tracks = [estimate.trajectory for estimate in estimates]
-    for i in (0, 1):
-        _scale(panels[i], [_span(np.rad2deg(t.rpy[:, i]), np.rad2deg(t.rpy_sd[:, i])) for t in tracks])
+    low = lower_end(main.trajectory.rpy[:, 2])
+    motions = [(estimate, _motion(estimate.trajectory, low)) for estimate in estimates]
+    for axes, name in zip(panels, ("roll", "pitch"), strict=False):
+        _series(axes, clock, [(estimate, found[name]) for estimate, found in motions])
+    for estimate, found in motions:
+        _draw_heading(panels[2], estimate, found["heading"], clock)
     for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]
-        panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
+        panels[2].plot(clock(time), within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
         difference = np.rad2deg(wrap_angle(heading - main.trajectory.at(time).rpy[:, 2]))
         panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
     names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
@@ -245,13 +256,10 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     return figure
 
 
-def _draw_attitude(panels: Sequence[Axes], estimate: Estimate, clock: TimeAxis, low: float) -> None:
-    track, some = estimate.trajectory, thin(len(estimate.trajectory))
-    time, rpy, sd = clock(track.time[some]), track.rpy[some], np.rad2deg(track.rpy_sd[some])
-    for i in (0, 1):
-        _line_and_band(panels[i], time, np.rad2deg(rpy[:, i]), sd[:, i], estimate.kind)
-    time, heading, spread = broken(time, _within(rpy[:, 2], low), sd[:, 2])
-    _line_and_band(panels[2], time, heading, spread, estimate.kind)
+def _draw_heading(axes: Axes, estimate: Estimate, heading: Series, clock: TimeAxis) -> None:
+    some = thin(len(estimate.trajectory))
+    lines = unwrapped(clock(estimate.trajectory.time[some]), heading.value[some], heading.sd[some])
+    _line_and_band(axes, lines[0], lines[1], lines[2], estimate.kind)
 
 
 def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tuple[Array, Array]]:
@@ -288,15 +296,6 @@ def _levelled(track: Trajectory, field_b: Array) -> Array:
     return np.arctan2(-level[:, 1], level[:, 0])
 
 
-def _speed(track: Trajectory) -> tuple[Array, Array]:
-    """Horizontal speed and its sd [m/s]."""
-    v = track.v_n[:, :2]
-    speed = np.linalg.norm(v, axis=1)
-    along = v / np.maximum(speed, 1e-6)[:, None]
-    variance = np.einsum("ni,nij,nj->n", along, track.cov_v[:, :2, :2], along)
-    return speed, np.sqrt(np.clip(variance, 0.0, None))
-
-
 def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) -> None:
     look = line_of(kind)
     if len(time) > DENSE:
@@ -304,37 +303,7 @@ def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) 
     axes.plot(time, value, label=name_of(kind), **look)
     if np.isfinite(sd).any():
         band = {"color": look["color"], "alpha": 0.18, "linewidth": 0, "zorder": look["zorder"] - 2}
-        axes.fill_between(time, value - 2 * sd, value + 2 * sd, **band)
-
-
-def _span(value: Array, sd: Array) -> tuple[float, float]:
-    """What an axis has to show of a line and its ±2 sd."""
-    spread = np.where(np.isfinite(sd), 2.0 * sd, 0.0)
-    known = np.isfinite(value)
-    if not known.any():
-        return np.inf, -np.inf
-    ends = np.percentile((value - spread)[known], USUAL[0]), np.percentile((value + spread)[known], USUAL[1])
-    return float(min(*ends, value[known].min())), float(max(*ends, value[known].max()))
-
-
-def _scale(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
-    """Have an axis show all of some spans, and little more."""
-    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
-    if high >= low:
-        margin = max(0.05 * (high - low), 1e-3)
-        axes.set_ylim(low - margin, high + margin)
-
-
-def _lower_end(track: Trajectory) -> float:
-    """Lower end of the heading axis [deg], 0 or -180, whichever breaks the line less often."""
-    jumps = {low: np.sum(np.abs(np.diff(_within(track.rpy[:, 2], low))) > 180.0) for low in (0.0, -180.0)}
-    return min(jumps, key=lambda low: jumps[low])
-
-
-def _within(heading: Array, low: float) -> Array:
-    """Heading [rad] in degrees from ``low`` to ``low + 360``."""
-    degrees: Array = (np.rad2deg(heading) - low) % 360.0 + low
-    return degrees
+        axes.fill_between(time, value - BAND * sd, value + BAND * sd, **band)
 
 
 def _limit_heading(axes: Axes, low: float) -> None:

@@ -10,8 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rovgraph.live.solution import Event, SensorHealth, Solution
-from rovgraph.report.tables import duration
-from rovgraph.report.units import plus_minus
+from rovgraph.report.units import duration, plus_minus
 
 REFRESH = 4.0  # [Hz]
 NEWEST = 5  # events shown

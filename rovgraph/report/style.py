@@ -138,21 +138,6 @@ def thin(n: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
     return np.linspace(0, n - 1, most).round().astype(np.int64)
 
 
-def broken(time: Array, angle_deg: Array, *others: Array) -> tuple[Array, ...]:
-    """Lines of a wrapped angle with NaN put in where it jumps, so that no line crosses.
-
-    Parameters
-    ----------
-    time, angle_deg, others : ndarray, shape (n,)
-
-    Returns
-    -------
-    the same arrays, longer by the number of jumps
-    """
-    at = np.flatnonzero(np.abs(np.diff(angle_deg)) > 180.0) + 1
-    return tuple(np.insert(np.asarray(x, float), at, np.nan) for x in (time, angle_deg, *others))
-
-
 def panel_grid(figure: Figure, count: int, columns: int) -> list[Axes]:
     """``count`` panels, row by row, with one common time axis."""
     lines = -(-count // columns)

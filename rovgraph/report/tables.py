@@ -14,7 +14,7 @@ from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.inference.observability import UNOBSERVABLE
 from rovgraph.log.units import shown
 from rovgraph.report.results import main_first, narrowing
-from rovgraph.report.units import label_with_unit, percent, plus_minus
+from rovgraph.report.units import duration, label_with_unit, percent, plus_minus
 
 
 def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:
@@ -51,8 +51,8 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
     return table
 
 
-def calibration_table(estimates: Sequence[Estimate]) -> Table:
-    """Calibration of the leading estimate beside its prior."""
+def calibration_table(estimates: Sequence[Estimate], verbose: bool = False) -> Table:
+    """Calibration of the leading estimate beside its prior; names of what is held at 0 only where ``verbose``."""
     main = main_first(estimates)[0]
     table = Table(
         title=f"calibration, {main.kind.replace('_', ' ')}",
@@ -70,22 +70,13 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
         name = label_with_unit(entry.label, entry.unit)
         table.add_row(escape(name), *_calibration_cells(entry), style="" if entry.estimated else "dim")
     notes = ["left: sd in percent of the prior's"] if any(e.estimated for e in shown) else []
-    notes += [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
+    if silent:
+        held = f"{len(silent)} calibration {'constant is' if len(silent) == 1 else 'constants are'} held at 0"
+        notes.append(f"{held}: {', '.join(e.label for e in silent)}" if verbose else f"{held} (--verbose lists them)")
     if any(e.verdict == UNOBSERVABLE for e in main.calibration):
         notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")
     table.caption = "\n".join(notes) or None
     return table
-
-
-def duration(seconds: float | None) -> str:
-    """Time in words, such as ``55 min 43 s``."""
-    if seconds is None:
-        return "unknown"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
 def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:

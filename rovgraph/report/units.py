@@ -55,3 +55,31 @@ def nice_step(seconds: float) -> float:
     """The round time step at or above ``seconds``, such as 15 s, 2 min, 1 h."""
     steps = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600)
     return next((float(s) for s in steps if s >= seconds), float(3600 * np.ceil(seconds / 3600)))
+
+
+def duration(seconds: float | None) -> str:
+    """Time in words, such as ``55 min 43 s``."""
+    if seconds is None:
+        return "unknown"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
+WORDS = {"acc": "accelerometer", "gyr": "gyro", "mag": "magnetometer", "ahrs": "AHRS", "dvl": "DVL", "imu": "IMU",
+         "sin": "sine part", "cos": "cosine part"}  # fmt: skip
+PARTS = {"x", "y", "z", "sin", "cos", "xx", "yy", "zz", "xy", "xz", "yz"}
+
+
+def words(key: str) -> str:
+    """The key of a sensor or a calibration variable in words.
+
+    >>> words("dvl_compass_deviation_sin"), words("acc_bias_x")
+    ('DVL compass deviation, sine part', 'accelerometer bias, x')
+    """
+    *most, last = key.split("_")
+    parts = [*most, last] if not most or last not in PARTS else most
+    text = " ".join(WORDS.get(part, part) for part in parts)
+    return text if len(parts) > len(most) else f"{text}, {WORDS.get(last, last)}"

@@ -12,9 +12,21 @@ from rovgraph.log.units import shown
 from rovgraph.model.calibration import TABLE
 from rovgraph.model.config import parse_config
 from rovgraph.report.colours import ESTIMATES
-from rovgraph.report.pages.page import Item, Missing, PageTable, Panel, Section, Trace, extremes, line
+from rovgraph.report.motion import axis_limits, span
+from rovgraph.report.pages.page import (
+    Item,
+    Missing,
+    PageTable,
+    Panel,
+    Section,
+    Text,
+    Trace,
+    extremes,
+    line,
+    packed,
+)
 from rovgraph.report.pages.source import DiveSource
-from rovgraph.report.units import plus_minus
+from rovgraph.report.units import plus_minus, words
 
 MOVED = 3.0  # prior sd beyond which a variable has moved suspiciously far
 
@@ -27,16 +39,29 @@ def calibration_section(source: DiveSource) -> Section:
     if table is None or table.empty:
         items.append(Missing("Calibration against prior", "calibration.csv is missing or has no rows of this estimate"))
     else:
-        items.append(_against_prior(table))
+        items += _against_prior(table)
     joint = ((source.summary.get("estimates") or {}).get(source.main.kind) or {}).get("calibration_covariance")
     if isinstance(joint, dict):
         lead += _words(joint)
         items.append(correlation_table(joint["labels"], np.array(joint["covariance"], float)))
     items += [*_histories(source), *_allan(source)]
-    return Section("calibration", "Calibration and biases", lead, items)
+    finding, well = _in_a_sentence(table)
+    return Section("calibration", "Calibration and biases", lead, items, finding=finding, well=well)
 
 
-def _against_prior(table: pd.DataFrame) -> PageTable:
+def _in_a_sentence(table: pd.DataFrame | None) -> tuple[str, bool | None]:
+    """What the dive showed of its instruments, and whether anything moved far."""
+    if table is None or table.empty or not {"verdict", "moved_in_prior_sd"} <= set(table):
+        return "What the dive showed of its instruments.", None
+    estimated = table[table["estimated"].astype(str) == "True"] if "estimated" in table else table
+    seen = int((estimated["verdict"] == "observable").sum())
+    moved = pd.to_numeric(table["moved_in_prior_sd"], errors="coerce")
+    far = [words(str(label)) for label in table.loc[np.abs(moved) > MOVED, "label"]]
+    sentence = f"The dive shows {seen} of {len(estimated)} variables that were estimated"
+    return f"{sentence}; {', '.join(far)} moved far." if far else f"{sentence}; none moved far.", not far
+
+
+def _against_prior(table: pd.DataFrame) -> list[Item]:
     held = (table["sd"] == 0) & (table["prior_sd"].fillna(0) == 0)
     rows = []
     for c in table[~held].to_dict("records"):
@@ -46,19 +71,21 @@ def _against_prior(table: pd.DataFrame) -> PageTable:
         verdict = str(c.get("verdict") or "") if c.get("verdict") == c.get("verdict") else ""
         rows.append(
             (
-                str(c["label"]) + ("" if c["unit"] in ("1", 1) else f" [{c['unit']}]"),
+                words(str(c["label"])) + ("" if c["unit"] in ("1", 1) else f" [{str(c['unit']).replace('deg', '°')}]"),
                 plus_minus(c["prior_mean"], c["prior_sd"]),
                 plus_minus(c["value"], c["sd"]),
                 (f"{moved:+.2f}" if isinstance(moved, float) and np.isfinite(moved) else "–") + flag,
                 f"{100 * left:.0f} %" if isinstance(left, float) and np.isfinite(left) else "–",
                 verdict,
                 needs(str(c["label"])) if verdict in ("weak", "unobservable") else "",
+                str(c["label"]),
             )
         )
-    head = ("variable", "prior", "after the dive", "moved [prior sd]", "sd left", "verdict", "what would help")
-    exact = ", ".join(table.loc[held, "label"].astype(str))
-    note = "± one standard deviation. considered: held, with its uncertainty in that of all else."
-    return PageTable("Calibration against prior", head, rows, note=note + (f" Exact: {exact}." if exact else ""))
+    head = ("variable", "prior", "after the dive", "moved [prior sd]", "sd left", "verdict", "what would help", "key")
+    note = "± one sd. considered: held, with its uncertainty in that of all else."
+    found: list[Item] = [PageTable("Calibration against prior", head, rows, note=note)]
+    exact = "\n".join(table.loc[held, "label"].astype(str))
+    return [*found, Text(f"{held.sum()} constants are held at their value without an sd", exact)] if exact else found
 
 
 def needs(label: str) -> str:
@@ -112,7 +139,7 @@ def _allan(source: DiveSource) -> list[Item]:
     except InputError as error:
         return [Missing("Allan deviation, as configured", str(error))]
     tau = np.geomspace(0.01, max(source.clock.end - source.clock.start, 1.0), 100)
-    note = "Falling: noise of the samples. Rising: walk of the bias. Calibrate noise measures both."
+    note = "Falling: noise of the samples. Rising: walk of the bias. `rovgraph calibrate noise` measures both."
     items: list[Item] = []
     for name, unit, density, walk in (
         ("accelerometer", "m/s²", noise.acc, noise.acc_walk),
@@ -133,25 +160,29 @@ def _histories(source: DiveSource) -> list[Item]:
     items: list[Item] = []
     for variable, own in table.groupby("variable", sort=False):
         drawn: list[Trace] = []
-        unit = ""
+        spans, unit = [], ""
         for kind, rows in own.groupby("estimate", sort=False):
             if kind not in ESTIMATES:
                 continue
             factor, unit = shown(str(rows["unit"].iloc[0]))
-            time = source.clock(rows["time"].to_numpy(float))
+            time = rows["time"].to_numpy(float)
             value, sd = factor * rows["value"].to_numpy(float), factor * rows["sd"].to_numpy(float)
-            drawn += _band(str(kind), time, value, sd)
+            drawn.append(_band(source, str(kind), time, value, sd))
+            spans.append(span(time, value, sd, BAND if kind == source.main.kind else 0.0))
         if drawn:
-            axis = str(variable) + ("" if unit in ("", "1") else f" [{unit}]")
-            items.append(Panel(str(variable), source.clock.label, axis, drawn, note="Bands: two standard deviations."))
+            name, key, unit = words(str(variable)), str(variable), unit.replace("deg", "°").replace("s2", "s²")
+            label = f"estimate [{unit or 1}]"
+            labels, limits = (source.clock.label, label), axis_limits(spans, 0.0)
+            title, note = name[:1].upper() + name[1:], "Bands: two sd."
+            items.append(Panel(title, *labels, drawn, note=note, wide=False, key=key, limits=limits))
     return items
 
 
-def _band(kind: str, time: np.ndarray, value: np.ndarray, sd: np.ndarray) -> list[Trace]:
+BAND = 2  # sds
+
+
+def _band(source: DiveSource, kind: str, time: np.ndarray, value: np.ndarray, sd: np.ndarray) -> Trace:
     some = extremes(value, sd, stretches=250)
-    t, v, s, colour = time[some], value[some], sd[some], ESTIMATES[kind]
-    none = {"width": 0, "showlegend": False, "hoverinfo": "skip", "quiet": True}
-    low = line(kind, t, v - 2 * s, colour, **none)
-    high = line(kind, t, v + 2 * s, colour, fill="tonexty", fillcolor=colour + "26", **none)
-    middle = line(kind, t, v, colour, dash="solid" if kind == "smoothed" else "dash")
-    return [low, high, middle] if np.isfinite(s).any() else [middle]
+    band = {"sd": packed(sd[some]), "band": BAND} if np.isfinite(sd).any() else {}
+    dash = "solid" if kind == "smoothed" else "dash"
+    return line(kind, source.clock(time[some]), value[some], ESTIMATES[kind], dash=dash, **band)

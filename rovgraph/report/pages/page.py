@@ -7,6 +7,7 @@ peaks stay visible.
 import base64
 import contextlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.errors import InputError
@@ -42,7 +43,7 @@ def packed(values: ArrayLike) -> str:
 
 
 def line(name: str, x: ArrayLike, y: ArrayLike, colour: str, **look: Any) -> Trace:
-    """A line; ``look`` has ``dash``, ``width``, or keys of Plotly's trace."""
+    """A line; ``look`` has ``dash``, ``width``, ``sd`` (packed) and ``band`` (sds to each side), or Plotly's keys."""
     style = {"color": colour, "width": look.pop("width", 1.5), "dash": look.pop("dash", "solid")}
     return {"name": name, "mode": "lines", "line": style, "x": packed(x), "y": packed(y), **look}
 
@@ -75,7 +76,11 @@ class Panel:
     log : which axes are logarithmic, of "x" and "y"
     wide : over the whole width
     names : of the places 1, 2, ... on the y axis, the first on top
-    reach : what is shown of y at first, to both sides of zero; 0 = all
+    limits : low, high of y at first; None = all
+    key : name in files and configuration, in small print
+    down : y grows downwards
+    ticks : the only values of y that there are
+    ramp : colours from low to high with their two labels, beside the title
     """
 
     title: str
@@ -89,14 +94,19 @@ class Panel:
     log: str = ""
     wide: bool = True
     names: Sequence[str] = ()
-    reach: float = 0.0
+    limits: tuple[float, float] | None = None
+    key: str = ""
+    down: bool = False
+    ramp: tuple[Sequence[str], str, str] | None = None
+    ticks: Sequence[float] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Data for ``page.js``."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
-        more = {"log": self.log, "names": [*self.names], "reach": self.reach}
-        return {**chosen, "levels": [*self.levels], "spans": spans, **more}
+        more = {"log": self.log, "names": [*self.names], "ticks": [*self.ticks]}
+        shown = {"limits": self.limits, "down": self.down}
+        return {**chosen, "levels": [*self.levels], "spans": spans, **more, **shown}
 
 
 @dataclass(frozen=True)
@@ -160,7 +170,9 @@ class Section:
     title : its heading
     lead : sentences under the heading
     items : panels, tables and text in order
-    lists : title -> lines, such as warnings
+    lists : title -> lines, such as warnings; open where they are few
+    finding : folded under the heading, with this sentence on what it shows
+    well : whether that is as it should be; None = neither
     """
 
     key: str
@@ -168,6 +180,34 @@ class Section:
     lead: Sequence[str] = ()
     items: Sequence[Item] = ()
     lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    finding: str = ""
+    well: bool | None = None
+
+
+@dataclass(frozen=True)
+class Opening:
+    """The first screen of a dive: a map, and beside it the verdict and a few numbers.
+
+    Attributes
+    ----------
+    chart : the map, or why there is none
+    verdict : a word, which chooses the colour
+    sentences : what it means, the first one large
+    facts : date, place and vehicle, as far as they are known
+    numbers : name -> value of the dive
+    counts : what there is to read on in the section ``verdict``, such as "2 alarms"
+    print_notes : on the second printed page only: title -> text
+    tables : on the second printed page only
+    """
+
+    chart: Panel | Missing
+    verdict: str
+    sentences: Sequence[str]
+    facts: Sequence[str]
+    numbers: Mapping[str, str]
+    counts: Sequence[str] = ()
+    print_notes: Mapping[str, str] = field(default_factory=dict)
+    tables: Sequence[PageTable] = ()
 
 
 KINDS = {Panel: "panel", PageTable: "table", Text: "text", Image: "image", Missing: "missing"}
@@ -179,6 +219,7 @@ def render(
     clock: Mapping[str, Any] | None = None,
     cursor: Mapping[str, Any] | None = None,
     origin: Mapping[str, float] | None = None,
+    opening: Opening | None = None,
 ) -> str:
     """The page's HTML.
 
@@ -189,6 +230,7 @@ def render(
     clock : unit and end of the time axis; None = nothing on the page has a time
     cursor : the track that the slider moves along, its arrays packed
     origin : latitude and longitude of north = east = 0
+    opening : the first screen; None = the page begins with its first section
     """
     panels = {
         f"{section.key}-{k}": item.as_dict()
@@ -196,8 +238,10 @@ def render(
         for k, item in enumerate(section.items)
         if isinstance(item, Panel)
     }
-    data = {"panels": panels, "clock": clock, "cursor": cursor, "origin": origin}
-    return _environment().get_template("page.html").render(title=title, sections=sections, data=_safe_json(data))
+    if opening is not None and isinstance(opening.chart, Panel):
+        panels["track"] = opening.chart.as_dict()
+    data = _safe_json({"panels": panels, "clock": clock, "cursor": cursor, "origin": origin})
+    return _environment().get_template("page.html").render(title=title, sections=sections, data=data, opening=opening)
 
 
 def write(path: Path, html: str) -> None:
@@ -225,6 +269,7 @@ def _environment() -> Environment:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.globals |= {"kind_of": lambda item: KINDS[type(item)], "asset": _asset, "shade": _shade}
+    environment.filters["explained"] = _explained
     return environment
 
 
@@ -240,6 +285,24 @@ def _safe_json(data: Mapping[str, Any]) -> Markup:
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return Markup(text)
+
+
+TERMS = {
+    "nees": "normalised estimation error squared: squared error over its variance; 1 per dimension on the average",
+    "separation": "filtered minus smoothed, over the sd that this difference should have",
+    "considered": "held at its mean, with its uncertainty in the sd of everything else (Schmidt's consider variable)",
+}  # words of the field that a reader may not know
+
+
+def _explained(text: object) -> Markup:
+    """Escaped text whose first use of each term has a tooltip."""
+    left = dict(TERMS)
+
+    def mark(found: re.Match[str]) -> str:
+        meaning = left.pop(found[0].lower(), None)
+        return found[0] if meaning is None else f'<abbr title="{escape(meaning)}">{found[0]}</abbr>'
+
+    return Markup(re.sub(rf"\b(?:{'|'.join(TERMS)})\b", mark, str(escape(text)), flags=re.IGNORECASE))
 
 
 def _shade(value: float) -> str:

@@ -4,12 +4,13 @@ from pathlib import Path
 
 from rovgraph.errors import InputError
 from rovgraph.report.pages.calibration import calibration_section
+from rovgraph.report.pages.dive import dive_section
 from rovgraph.report.pages.page import render, write
 from rovgraph.report.pages.sensors import clocks_section, compass_section, dvl_section, residuals_section
 from rovgraph.report.pages.source import PAGE, DiveSource, ResultsSource, about_section, damage_named, smooth_command
-from rovgraph.report.pages.track import cursor, origin, track_section
-from rovgraph.report.pages.uncertainty import separation_section, uncertainty_section
-from rovgraph.report.pages.verdict import verdict_section
+from rovgraph.report.pages.track import cursor, origin
+from rovgraph.report.pages.uncertainty import separation_section
+from rovgraph.report.pages.verdict import opening, verdict_section
 
 
 def dive_page(source: DiveSource) -> str:
@@ -20,21 +21,20 @@ def dive_page(source: DiveSource) -> str:
     InputError : a file that cannot be read, or no trajectory
     """
     sections = [
+        dive_section(source),
         verdict_section(source),
-        track_section(source),
-        uncertainty_section(source),
         separation_section(source),
         dvl_section(source),
         residuals_section(source),
         compass_section(source),
         clocks_section(source),
         calibration_section(source),
-        about_section(source, smooth_command(source)),
+        about_section(source, smooth_command(source), folded=True),
     ]
     clock = source.clock
     time = {"unit": clock.unit, "end": float((clock.end - clock.start) / clock.scale), "label": clock.label}
-    title = f"{source.summary.get('name') or Path(source.folder).name}: track and its quality"
-    return render(title, sections, time, cursor(source), origin(source))
+    title = str(source.summary.get("name") or Path(source.folder).name)
+    return render(title, sections, time, cursor(source), origin(source), opening(source))
 
 
 def page_of(folder: Path) -> str:

@@ -32,6 +32,7 @@ from rovgraph.report.pages.page import (
     spread,
 )
 from rovgraph.report.pages.source import DiveSource, DiveTime
+from rovgraph.report.units import words
 
 BINS = 240  # of the dive; on a narrow screen a bin is hardly wider than a pixel
 PINGS = 4  # of a bin, at least, on the average
@@ -122,25 +123,30 @@ def dvl_section(source: DiveSource) -> Section:
     """Lock, altitude, beams, figure of merit, silences and velocities."""
     title, clock, pings = "DVL", source.clock, source.pings
     if pings is None:
-        return Section("dvl", title, (), [Missing("Pings", "the folder has no dvl.csv: no DVL, or an older version")])
+        why = "the folder has no dvl.csv: no DVL, or an older version"
+        return Section("dvl", title, (), [Missing("Pings", why)], finding="There are no pings to show.")
     time, lock = pings["time"].to_numpy(float), pings["lock"].to_numpy(float)
     items: list[Item] = []
-    altitude = pings["altitude"].to_numpy(float)
     spans = [(*clock(np.array(s)).tolist(), SHADE) for s in source.silences]
-    if np.isfinite(altitude).any():
-        drawn = [_over_time(source, "altitude", time, altitude)]
-        items.append(Panel("Altitude over the bottom", clock.label, "altitude [m]", drawn, spans=spans))
-    else:
-        items.append(Missing("Altitude over the bottom", "the log has no dvl_altitude"))
     drawn = [_over_time(source, "bottom lock", time, lock, line_shape="hv")]
     seen = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom" if len(lock) else "There is no ping"
     note = f"{seen}; one that repeats the ping before it saw nothing. Shaded: silences."
-    items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans))
+    items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans, ticks=(0.0, 1.0)))
     items += beam_items(source, spans)
     items.append(_silences(time[lock == 1]))
     items += _merit(source, pings)
     items += _velocities(source, spans)
-    return Section("dvl", title, (), items)
+    gap = max((end - begin for begin, end in source.silences), default=0.0)
+    finding = f"{seen}" + (f"; the longest silence took {gap:.3g} s." if gap else "; it never fell silent.")
+    well = not _sensors_with(source, "alarms", ("dvl",)) if len(lock) else None
+    return Section("dvl", title, (), items, finding=finding, well=well)
+
+
+def _sensors_with(source: DiveSource, list_of: str, sensors: Sequence[str], kinds: Sequence[str] = ()) -> list[str]:
+    """Those of some sensors that the summary's alarms or advice name, of ``kinds`` only where they are given."""
+    entries = source.summary.get(list_of) or []
+    named = {e.get("sensor") for e in entries if not kinds or e.get("kind") in kinds}
+    return [sensor for sensor in sensors if sensor in named]
 
 
 def _over_time(source: DiveSource, name: str, time: Array, values: Array, **look: str) -> Trace:
@@ -215,11 +221,35 @@ def residuals_section(source: DiveSource) -> Section:
         items.append(Missing("Residuals", "no measurement was compared with the estimate"))
     else:
         for (sensor, component), own in rows.groupby(["sensor", "component"], sort=False):
-            items += _residual_panels(source, f"{sensor} {component}", own)
-    return Section("residuals", "Residuals", lead, items)
+            items += _residual_panels(source, str(sensor), str(component), own)
+    finding, well = _residuals_in_a_sentence(source)
+    return Section("residuals", "Residuals", lead, items, finding=finding, well=well)
 
 
-def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterator[Item]:
+RESIDUAL_KINDS = ("too large", "lasting", "innovations", "rejected", "filter alone", "taken out")  # of alarms
+
+
+def _residuals_in_a_sentence(source: DiveSource) -> tuple[str, bool | None]:
+    """Whether every sensor is as good as stated, by the dive's alarms and advice."""
+    if source.residuals is None or source.residuals.empty:
+        return "There are no residuals to show.", None
+    sensors = [str(s) for s in source.residuals["sensor"].unique()]
+    worse = _sensors_with(source, "alarms", sensors, RESIDUAL_KINDS)
+    better = [s for s in _sensors_with(source, "advice", sensors, ("too small",)) if s not in worse]
+    if not worse and not better:
+        return "Every sensor's are as large as stated.", True
+    parts = [
+        f"{len(some)} of {len(sensors)} sensors {'errs' if len(some) == 1 else 'err'} {what} "
+        f"({', '.join(map(words, some))})"
+        for some, what in ((worse, "more than stated, or for longer"), (better, "less than stated"))
+        if some
+    ]
+    return "; ".join(parts) + ".", not worse
+
+
+def _residual_panels(source: DiveSource, sensor: str, component: str, own: pd.DataFrame) -> Iterator[Item]:
+    key = f"{sensor} {component}"
+    name = words(sensor) if sensor.endswith(component) else f"{words(sensor)}, {component}"
     time, z = source.clock(own["time"].to_numpy(float)), own["normalised"].to_numpy(float)
     used = own["weight"].to_numpy(float) > 0
     drawn = []
@@ -232,7 +262,8 @@ def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterat
     beyond = int(np.count_nonzero(np.abs(z) > reach))
     note = f"{beyond} lie beyond what is shown: a double click shows all." if beyond else ""
     labels = (source.clock.label, "residual / sd")
-    yield Panel(f"{name}: residual", *labels, drawn, note=note, levels=(-3.0, 0.0, 3.0), reach=reach)
+    limits = (-reach, reach)
+    yield Panel(f"{name}: residual", *labels, drawn, note=note, levels=(-3.0, 0.0, 3.0), limits=limits, key=key)
     fitted = z[used & np.isfinite(z)]
     if len(fitted) < 2:
         yield Missing(f"{name}: distribution", "fewer than two measurements were used")
@@ -245,17 +276,17 @@ def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterat
     drawn.append(line("normal", centre, normal, RED))
     note = f"rms {np.sqrt(np.mean(fitted**2)):.2f}, 1 where the noise is as stated. The outer bars hold what is beyond."
     labels = ("residual / sd", "density")
-    yield Panel(f"{name}: distribution", *labels, drawn, kind="xy", note=note, wide=False)
-    yield _autocorrelation(name, fitted)
+    yield Panel(f"{name}: distribution", *labels, drawn, kind="xy", note=note, wide=False, key=key)
+    yield _autocorrelation(name, key, fitted)
 
 
-def _autocorrelation(name: str, z: Array) -> Item:
+def _autocorrelation(name: str, key: str, z: Array) -> Item:
     rho = autocorrelation(z, LAGS)
     band = 2.0 / np.sqrt(len(z))
     drawn = [bars("autocorrelation", np.arange(1, len(rho) + 1), rho, "#8FBBD9", 0.8)]
     labels = ("lag [measurements]", "autocorrelation")
-    note = "Between the lines: 95 % of white noise."
-    return Panel(f"{name}: autocorrelation", *labels, drawn, kind="xy", levels=(-band, band), note=note, wide=False)
+    levels, note = (-band, band), "Between the lines: 95 % of white noise."
+    return Panel(f"{name}: autocorrelation", *labels, drawn, kind="xy", levels=levels, note=note, wide=False, key=key)
 
 
 def autocorrelation(z: Array, lags: int) -> Array:
@@ -290,7 +321,8 @@ def clocks_section(source: DiveSource) -> Section:
     keys = ("recorded", "used", "rejected", "rate_hz", "from_s", "to_s", "longest_gap_s", "longest_gap_at_s",
             "jitter_s", "repeats")  # fmt: skip
     rows = []
-    for sensor, numbers in (source.summary.get("sensors") or {}).items():
+    sensors = source.summary.get("sensors") or {}
+    for sensor, numbers in sensors.items():
         cells = [numbers.get(key) for key in keys]
         rows.append(
             (str(sensor), *("–" if c is None else f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells))
@@ -299,7 +331,12 @@ def clocks_section(source: DiveSource) -> Section:
         "Times count from the first measurement of the log. Jitter: half the width of the middle 90 % of the periods."
     )
     items: list[Item] = [PageTable("Clocks, rates and gaps", head, rows, note=note), *_periods(source)]
-    return Section("clocks", "Clocks and gaps", (), items)
+    gaps = {str(s): n["longest_gap_s"] for s, n in sensors.items() if n.get("longest_gap_s") is not None}
+    worst = max(gaps, key=gaps.__getitem__, default="")
+    finding = f"The longest gap took {gaps[worst]:.3g} s ({words(worst)})." if gaps else "What came when."
+    late = [e.get("sensor") for e in source.summary.get("alarms") or [] if e.get("kind") in ("clock", "check")]
+    doubt = f" An alarm names {', '.join(words(str(s)) for s in dict.fromkeys(late))}." if late else ""
+    return Section("clocks", "Clocks and gaps", (), items, finding=finding + doubt, well=not late if gaps else None)
 
 
 def _periods(source: DiveSource) -> list[Item]:
@@ -330,14 +367,31 @@ def compass_section(source: DiveSource) -> Section:
     rows = source.residuals
     title = "Compasses"
     if rows is None:
-        return Section("compasses", title, (), [Missing("Deviation", "the folder has no residuals.csv")])
+        missing = [Missing("Deviation", "the folder has no residuals.csv")]
+        return Section("compasses", title, (), missing, finding="There are no residuals to show.")
     headings = rows[(rows["component"] == "heading") & (rows["weight"] > 0)]
-    items: list[Item] = [_deviation(source, str(s), own) for s, own in headings.groupby("sensor", sort=False)]
+    used = {str(s): own for s, own in headings.groupby("sensor", sort=False)}
+    items: list[Item] = [_deviation(source, s, own) for s, own in used.items()]
     if not items:
         items = [Missing("Deviation", "no compass that measures a heading was used; a magnetometer is in Residuals")]
-    measured = {str(s): own for s, own in headings.groupby("sensor", sort=False)} if "measured" in rows else {}
-    items += [_pair(source, a, measured[a], b, measured[b]) for a, b in combinations(measured, 2)]
-    return Section("compasses", title, ["A wave with one period per turn is deviation."], items)
+    if "measured" in rows:
+        items += [_pair(source, a, used[a], b, used[b]) for a, b in combinations(used, 2)]
+    finding, well = _compasses_in_a_sentence(source, [*used])
+    return Section(
+        "compasses", title, ["A wave with one period per turn is deviation."], items, finding=finding, well=well
+    )
+
+
+def _compasses_in_a_sentence(source: DiveSource, used: Sequence[str]) -> tuple[str, bool | None]:
+    """How far each one deviates."""
+    if not used:
+        return "No compass that measures a heading was used.", None
+    parts = []
+    for sensor in used:
+        fit = _fit(source, sensor)
+        by = "no deviation was estimated" if fit is None else f"deviates by up to {np.hypot(*fit[1:]):.2g}°"
+        parts.append(f"{words(sensor)}: {by}")
+    return "; ".join(parts) + ".", not _sensors_with(source, "alarms", used)
 
 
 def _heading(source: DiveSource, time: Array) -> Array:
@@ -355,12 +409,12 @@ def _deviation(source: DiveSource, sensor: str, own: pd.DataFrame) -> Item:
     time = own["time"].to_numpy(float)
     residual = np.rad2deg(own["innovation"].to_numpy(float))
     look = {"size": 3, "t": packed(source.clock(time))}
-    title = f"{sensor}: deviation against heading"
+    title, key = f"{words(sensor)}: deviation against heading", sensor
     fit = _fit(source, sensor)
     if fit is None or "predicted" not in own:
         drawn = [points("residual", _heading(source, time), residual, "#0072B2", **look)]
         note = "No deviation curve was estimated."
-        return Panel(title, "heading [°]", "residual [°]", drawn, kind="xy", note=note, wide=False)
+        return Panel(title, "heading [°]", "residual [°]", drawn, kind="xy", note=note, wide=False, key=key)
     offset, sine, cosine = fit
     heading = np.rad2deg(own["predicted"].to_numpy(float)) - offset
     for _ in range(5):  # predicted = heading + offset + deviation(heading)
@@ -372,7 +426,8 @@ def _deviation(source: DiveSource, sensor: str, own: pd.DataFrame) -> Item:
         points("residual after the fit", heading, residual, "#8A8A8A", visible="legendonly", **look),
     ]
     note = f"Deviation: {sine:.2f}° sin h + {cosine:.2f}° cos h, h the heading of the compass's own axis."
-    return Panel(title, "heading of the compass [°]", "deviation [°]", drawn, kind="xy", note=note, wide=False)
+    labels = ("heading of the compass [°]", "deviation [°]")
+    return Panel(title, *labels, drawn, kind="xy", note=note, wide=False, key=key)
 
 
 def _curve(sine: float, cosine: float, heading: Array) -> Array:
@@ -395,7 +450,7 @@ def _fit(source: DiveSource, sensor: str) -> tuple[float, float, float] | None:
 
 def _pair(source: DiveSource, a: str, first: pd.DataFrame, b: str, second: pd.DataFrame) -> Item:
     """The difference of two compasses as recorded, against heading."""
-    title = f"{a} minus {b}, as recorded"
+    title = f"{words(a)} minus {words(b)}, as recorded"
     left = first[["time", "measured"]].sort_values("time")
     right = second[["time", "measured"]].sort_values("time")
     both = pd.merge_asof(left, right, on="time", direction="nearest", tolerance=0.5, suffixes=("_a", "_b"))  # type: ignore[arg-type]

@@ -296,7 +296,7 @@ class DiveSource(ResultsSource):
 PAGE = "report.html"
 
 
-def about_section(source: ResultsSource, command: str = "") -> Section:
+def about_section(source: ResultsSource, command: str = "", folded: bool = False) -> Section:
     """Configuration, versions, files and, where it is known, the command."""
     items: list[Item] = []
     if command:
@@ -311,7 +311,8 @@ def about_section(source: ResultsSource, command: str = "") -> Section:
     items.append(
         Text("Configuration in effect", config) if config else Missing("Configuration", "config.yaml is missing")
     )
-    return Section("about", "Configuration, versions and files", (), items)
+    finding = f"Made by rovgraph {source.summary.get('version', 'of an unknown version')}; how to make it again."
+    return Section("about", "Configuration, versions and files", (), items, finding=finding if folded else "")
 
 
 def smooth_command(source: ResultsSource) -> str:

@@ -1,6 +1,7 @@
-"""Section on the track, seen from above: estimates, fixes, ellipses, outages, and data for the cursor."""
+"""The track seen from above: in the colours of its sd, with fixes, ellipses and outages, and data for the cursor."""
 
 import html
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,39 +9,76 @@ import pandas as pd
 from numpy.typing import NDArray
 from pymap3d.rcurve import meridian, transverse
 
-from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
-from rovgraph.report.pages.page import Item, Missing, Panel, Section, Trace, extremes, line, packed, points, spread
+from rovgraph.geometry import Array
+from rovgraph.report.colours import ESTIMATES, REJECTED, USED
+from rovgraph.report.pages.page import Missing, Panel, Trace, extremes, line, packed, points, spread
 from rovgraph.report.pages.source import KINDS, DiveSource, PageTrack
 
-ELLIPSES = 24
+ELLIPSES, ELLIPSE = 24, "#8A8A9A"
 SPACED = np.linspace(0.0, 2 * np.pi, 41)
 SILENT, MARK = "#B35900", "#6A3D9A"
+# of the sd from low to high, dark to light: readable for the colour-blind and in grey (viridis, its pale end left out)
+RAMP = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80", "#5EC962", "#ADDC30", "#DDE318", "#FDC926")
 POLAR_DEG = 89.0  # beyond it a degree of longitude is no length to draw with
 
 
-def track_section(source: DiveSource) -> Section:
-    """The map."""
-    lead = ["North is up. Move the slider below or the mouse over any plot: the arrow shows where the vehicle was."]
-    if source.summary.get("origin") is None:
-        lead.append("Latitude and longitude are not known: the log has no fix_lat, the configuration no origin.")
-    lead += [f"The folder has no {kind.replace('_', ' ')} track." for kind in KINDS if kind not in source.tracks]
-    if source.residuals is None:
-        lead.append("residuals.csv is missing, so fixes cannot be shown.")
-    elif not (source.residuals["sensor"] == "fix").any():
-        lead.append("The dive has no position fixes.")
+def track_chart(source: DiveSource) -> Panel | Missing:
+    """The map; the main track in the colours of its sd."""
+    if not np.isfinite(source.main["north"]).any():
+        return Missing("Track", "the trajectory holds no known position")
+    coloured, ramp = _coloured(source)
     traces = [
-        *_lines(source),
-        *_silent(source),
-        *_fixes(source.residuals, source),
+        *_lines(source, without=source.main.kind if coloured else ""),
         *_ellipses(source.main),
+        *_fixes(source.residuals, source),
+        *_silent(source),
+        *coloured,
         *_ends(source),
         *_marks(source.frame("marks.csv", "name", "north", "east")),
     ]
-    note = "Ellipses hold 99 %. The thick line marks parts without bottom lock."
-    chart: Item = Panel("Track", "east [m]", "north [m]", traces, kind="map", note=note)
-    if not np.isfinite(source.main["north"]).any():
-        chart = Missing("Track", "the trajectory holds no known position")
-    return Section("track", "Track", lead, [chart])
+    title = "Track, coloured by its sd" if ramp else "Track"
+    return Panel(title, "east [m]", "north [m]", traces, kind="map", ramp=ramp)
+
+
+def track_notes(source: DiveSource) -> list[str]:
+    """What the map cannot show, a sentence each."""
+    notes = []
+    if source.summary.get("origin") is None:
+        notes.append("Latitude and longitude are not known: the log has no fix_lat, the configuration no origin.")
+    notes += [f"The folder has no {kind.replace('_', ' ')} track." for kind in KINDS if kind not in source.tracks]
+    if source.residuals is None:
+        notes.append("residuals.csv is missing, so fixes cannot be shown.")
+    return notes
+
+
+def _coloured(source: DiveSource) -> tuple[list[Trace], tuple[Sequence[str], str, str] | None]:
+    """The main track in a piece for each colour, and the colours with the sd of both ends; none without an sd."""
+    track, sd = source.main, source.main.horizontal_sd
+    some = extremes(track["north"], track["east"])
+    known = sd[some][np.isfinite(sd[some])]
+    if len(known) < 2:
+        return [], None
+    low, high = float(known.min()), float(known.max())
+    share = (np.where(np.isnan(sd[some]), low, sd[some]) - low) / max(high - low, 1e-9)
+    step = np.clip((share * len(RAMP)).astype(int), 0, len(RAMP) - 1)[:-1]
+    digits = int(np.clip(1 - np.floor(np.log10(max(high, 1e-3))), 1, 3))
+    drawn = []
+    for k, colour in enumerate(RAMP):
+        pieces = np.flatnonzero(step == k)
+        if not len(pieces):
+            continue
+        breaks = np.flatnonzero(np.diff(pieces) > 1) + 1
+        index = np.concatenate([np.append(part, [part[-1] + 1, -1]) for part in np.split(pieces, breaks)])
+        columns = {name: values[some][index] for name, values in _seen(source, track, sd).items()}
+        for values in columns.values():
+            values[index < 0] = np.nan
+        look = {"width": 3.5, "t": packed(columns["t"]), "value": packed(columns["sd"]), "showlegend": False}
+        drawn.append(line(f"{track.name} {k}", columns["east"], columns["north"], colour, **look))
+    return drawn, (RAMP, f"{low:.{digits}f} m", f"{high:.{digits}f} m")
+
+
+def _seen(source: DiveSource, track: PageTrack, sd: Array) -> dict[str, Array]:
+    return {"t": source.clock(track["time"]), "north": track["north"].copy(), "east": track["east"].copy(), "sd": sd}
 
 
 def cursor(source: DiveSource) -> dict[str, Any]:
@@ -81,12 +119,15 @@ def _thinned(track: PageTrack) -> NDArray[np.intp]:
     return extremes(track["north"], track["east"])
 
 
-def _lines(source: DiveSource) -> list[Trace]:
+def _lines(source: DiveSource, without: str) -> list[Trace]:
     dashes = {"smoothed": "solid", "filtered": "dash", "dead_reckoning": "dot"}
     drawn = []
     for kind, track in reversed(source.tracks.items()):
+        if kind == without:
+            continue
         some = _thinned(track)
-        look = {"dash": dashes[kind], "width": 2.0 if kind == source.main.kind else 1.3}
+        look: dict[str, Any] = {"dash": dashes[kind], "width": 1.3}
+        look |= {} if kind == source.main.kind else {"visible": "legendonly"}
         when = packed(source.clock(track["time"][some]))
         drawn.append(line(track.name, track["east"][some], track["north"][some], ESTIMATES[kind], t=when, **look))
     return drawn
@@ -144,7 +185,7 @@ def _ellipses(track: PageTrack) -> list[Trace]:
     gap = np.full((len(some), 1), np.nan)
     north = np.hstack([track["north"][some, None] + c * a - s * b, gap]).ravel()
     east = np.hstack([track["east"][some, None] + s * a + c * b, gap]).ravel()
-    return [line(f"99 %, {track.name}", east, north, OTHER, width=0.9, hoverinfo="skip")]
+    return [line("99 % ellipses", east, north, ELLIPSE, width=0.9, hoverinfo="skip")]
 
 
 def _ends(source: DiveSource) -> list[Trace]:

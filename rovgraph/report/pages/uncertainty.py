@@ -1,4 +1,4 @@
-"""Section on uncertainty: standard deviations against time, what reduced them, and filter against smoother."""
+"""Standard deviations against time, what reduced them, and the section that compares filter and smoother."""
 
 from collections.abc import Callable
 
@@ -7,6 +7,7 @@ import pandas as pd
 
 from rovgraph.geometry import Array
 from rovgraph.report.colours import ESTIMATES, USED
+from rovgraph.report.motion import axis_limits, span
 from rovgraph.report.pages.page import Item, Missing, Panel, Section, Trace, extremes, line, points
 from rovgraph.report.pages.source import DiveSource, PageTrack
 
@@ -15,14 +16,15 @@ WITHIN_S = 10.0
 TURN = np.deg2rad(45.0)  # of the heading around that time: a manoeuvre
 SAME = 0.05  # P_filtered - P_smoothed below this part of P_filtered: as good as the same, no separation to expect
 SURER, OFTEN = 1.1, 0.1  # smoothed over filtered sd, and the share of epochs, from which that is explained
+MOST_BEYOND = 0.02  # of the separation, beyond three sd: a few times what chance brings, as it is correlated in time
 SHOWN: tuple[tuple[str, str, Callable[[PageTrack], Array]], ...] = (
-    ("Horizontal position, one standard deviation along the worst direction", "m", lambda t: t.horizontal_sd),
-    ("Heading, one standard deviation", "°", lambda t: np.rad2deg(t["yaw_sd"])),
+    ("Position sd, along the worst direction", "m", lambda t: t.horizontal_sd),
+    ("Heading sd", "°", lambda t: np.rad2deg(t["yaw_sd"])),
 )
 CAUSES = {"fix": USED, "place": "#7B3294", "bottom lock again": "#B35900", "turn": "#000000", "other": "#888888"}
 
 
-def uncertainty_section(source: DiveSource) -> Section:
+def sd_panels(source: DiveSource) -> list[Item]:
     """sd of position and heading with marks of what helped."""
     items: list[Item] = []
     for title, unit, of in SHOWN:
@@ -32,17 +34,26 @@ def uncertainty_section(source: DiveSource) -> Section:
             continue
         followed = source.tracks.get("filtered", source.main)
         marks = _marks(source, followed, of(followed))
-        note = f"Marks: where the sd of the {followed.name} estimate fell by more than 15 % within 10 s, and by what."
-        items.append(Panel(title, source.clock.label, f"sd [{unit}]", [*lines, *marks], note=note))
-    lead = ["The filtered sd uses the measurements so far, the smoothed one those of the whole dive."]
-    if {"filtered", "smoothed"} <= set(source.tracks):
-        sds = ([of(source.tracks[kind]) for kind in ("filtered", "smoothed")] for _, _, of in SHOWN)
-        if any(np.mean(smoothed > SURER * filtered) > OFTEN for filtered, smoothed in sds):
-            lead.append(
-                "Where the filtered sd is the smaller one, believe the smoothed: over a long time the filter takes "
-                "noise for knowledge of what nothing shows, such as a heading without position fixes."
-            )
-    return Section("uncertainty", "How well it is known", lead, items)
+        zero = [span(t["time"], of(t), np.zeros(len(t)), 0.0) for t in source.tracks.values()]
+        limits = axis_limits([(0.0, 0.0), *(s for s in zero if s[1] >= s[0])])
+        labels = (source.clock.label, f"sd [{unit}]")
+        note = f"Marks: what made the {followed.name} sd fall." if marks else ""
+        items.append(Panel(title, *labels, [*lines, *marks], note=note, wide=False, limits=limits))
+    return items
+
+
+def sd_notes(source: DiveSource) -> list[str]:
+    """How to read the sds of two estimates, a sentence each."""
+    if not {"filtered", "smoothed"} <= set(source.tracks):
+        return []
+    notes = ["The filtered sd uses the measurements so far, the smoothed one those of the whole dive."]
+    sds = ([of(source.tracks[kind]) for kind in ("filtered", "smoothed")] for _, _, of in SHOWN)
+    if any(np.mean(smoothed > SURER * filtered) > OFTEN for filtered, smoothed in sds):
+        notes.append(
+            "Where the filtered sd is the smaller one, believe the smoothed: over a long time the filter takes "
+            "noise for knowledge of what nothing shows, such as a heading without position fixes."
+        )
+    return notes
 
 
 def _sd_lines(source: DiveSource, of: Callable[[PageTrack], Array]) -> list[Trace]:
@@ -116,32 +127,54 @@ def separation_section(source: DiveSource) -> Section:
     The smoother contains what the filter knew, so that the variance of their difference is P_f - P_s.
     """
     lead = [
+        *sd_notes(source),
         "Filtered minus smoothed, over its expected standard deviation. Nearly all of it should stay within ±3; "
-        "an excursion shows when the filter was surer than it should have been."
+        "an excursion shows when the filter was surer than it should have been.",
     ]
     title = "Separation of filtered and smoothed"
     if not {"filtered", "smoothed"} <= set(source.tracks):
         missing = "it takes both estimates; run rovgraph smooth with --estimate both"
-        return Section("separation", "Separation", lead, [Missing(title, missing)])
+        return Section(
+            "separation",
+            "Filter against smoother",
+            lead,
+            [Missing(title, missing)],
+            finding=f"Not compared: {missing}.",
+        )
     filtered, smoothed = source.tracks["filtered"], source.tracks["smoothed"]
     colours = {"north": "#0072B2", "east": "#D55E00", "down": "#009E73", "yaw": "#7B3294"}
-    drawn, unknown = [], 0.0
+    drawn, unknown, beyond, known = [], 0.0, 0, 0
     for name, colour in colours.items():
         time, values = separation(filtered, smoothed, name)
         unknown = max(unknown, float(np.isnan(values).mean()))
         if np.isfinite(values).any():
+            beyond, known = beyond + int((np.abs(values) > 3.0).sum()), known + int(np.isfinite(values).sum())
             some = extremes(values)
             drawn.append(line("heading" if name == "yaw" else name, source.clock(time[some]), values[some], colour))
     if not drawn:
         missing = "the standard deviations of the estimates are not known, or the same"
-        return Section("separation", "Separation", lead, [Missing(title, missing)])
+        return Section(
+            "separation",
+            "Filter against smoother",
+            lead,
+            [Missing(title, missing)],
+            finding=f"Not compared: {missing}.",
+        )
     note = (
         f"Left out, up to {100 * unknown:.0f} % of a line: where smoothing made the sd no smaller."
         if unknown > 0.01
         else ""
     )
     chart = Panel(title, source.clock.label, "difference / its sd", drawn, levels=(-3.0, 0.0, 3.0), note=note)
-    return Section("separation", "Separation", lead, [chart])
+    well = beyond <= MOST_BEYOND * known
+    agree = "The filter agrees with the smoother" if well else "The filter was surer than it should have been"
+    finding = f"{agree}: {100.0 * (1.0 - beyond / known):.1f} % of their separation within 3 sd."
+    return Section("separation", "Filter against smoother", lead, [chart], finding=finding, well=well)
+
+
+def _not_compared(lead: list[str], missing: str) -> Section:
+    items = [Missing("Separation of filtered and smoothed", missing)]
+    return Section("separation", "Filter against smoother", lead, items, finding=f"Not compared: {missing}.")
 
 
 def separation(filtered: PageTrack, smoothed: PageTrack, name: str) -> tuple[Array, Array]:

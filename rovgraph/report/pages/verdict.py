@@ -1,17 +1,21 @@
-"""Section on the verdict, in plain words: how good the track is, what limits it, and what to do next time.
+"""The first screen and the verdict, in plain words: how good the track is, what limits it, and what to do next time.
 
 Sources of variance are grouped by what a person can change.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from rovgraph.report.pages.page import PageTable, Section
+from rovgraph.report.assumptions import leading
+from rovgraph.report.pages.page import Opening, PageTable, Section
 from rovgraph.report.pages.source import DiveSource, PageTrack
-from rovgraph.report.units import plus_minus
+from rovgraph.report.pages.track import track_chart, track_notes
+from rovgraph.report.units import duration, plus_minus, words
 
 HEADING = (
     *("mag", "ahrs", "dvl_heading", "vehicle_heading", "hard_iron", "soft_iron", "field_"),
@@ -101,20 +105,100 @@ GOOD = {
 }
 
 
-def verdict_section(source: DiveSource) -> Section:
-    """Verdict, what limits the track, advice, alarms, assumptions and warnings."""
+def opening(source: DiveSource) -> Opening:
+    """The first screen: map, verdict, where and when, and five numbers."""
     summary = source.summary
-    alarms = [f"{a.get('severity', '')}: {a.get('text', '')}" for a in summary.get("alarms") or []]
+    named = (("alarm", "alarms"), ("warning", "warnings"), ("piece of advice", "pieces of advice"))
+    lengths = (len(summary.get(key) or []) for key in ("alarms", "warnings", "advice"))
+    return Opening(
+        chart=track_chart(source),
+        verdict=str(summary.get("verdict", "unknown")),
+        sentences=[how_good(source), *_why(source), *limits(source)],
+        facts=_facts(source),
+        numbers=_five(source),
+        counts=[f"{n} {one if n == 1 else many}" for n, (one, many) in zip(lengths, named, strict=True) if n],
+        print_notes=print_notes(source),
+        tables=[_numbers(source)],
+    )
+
+
+def verdict_section(source: DiveSource) -> Section:
+    """Alarms, warnings, advice and assumptions behind the verdict."""
+    summary = source.summary
+    first, others = leading(summary.get("assumptions") or [])
     lists = {
-        "Alarms": alarms,
+        "Alarms": [f"{a.get('severity', '')}: {a.get('text', '')}" for a in summary.get("alarms") or []],
         "Warnings about the log": summary.get("warnings") or [],
-        "Assumed, because neither log nor configuration said": summary.get("assumptions") or [],
+        "Assumed: what matters for this track": first,
+        "Assumed beside it": others,
         "Advice: no evidence of error": [str(a.get("text", "")) for a in summary.get("advice") or []],
     }
     notes = [source.other_version] if source.other_version else []
-    lead = [how_good(source), *limits(source), *notes]
-    title = f"Verdict: {summary.get('verdict', 'unknown')}"
-    return Section("verdict", title, lead, [_numbers(source)], {k: v for k, v in lists.items() if v})
+    lead = [*notes, *track_notes(source)]
+    known = {name: lines for name, lines in lists.items() if lines}
+    return Section("verdict", "Alarms and assumptions", lead, [_numbers(source)], known)
+
+
+def _why(source: DiveSource) -> list[str]:
+    """The first alarm without its remedy, of a dive that can be used with care."""
+    alarms = source.summary.get("alarms") or []
+    if source.summary.get("verdict") != "doubtful" or not alarms:
+        return []
+    return [f"Why: {str(alarms[0].get('text', '')).partition('; ')[0]}."]
+
+
+def _facts(source: DiveSource) -> list[str]:
+    """Vehicle, date and place as far as they are known, and the log."""
+    facts = []
+    unix = source.main["unix_time"][0]
+    if np.isfinite(unix):
+        facts.append(f"{datetime.fromtimestamp(float(unix), UTC):%d %B %Y, %H:%M} UTC".lstrip("0"))
+    place = source.summary.get("origin")
+    if isinstance(place, dict) and all(isinstance(place.get(k), int | float) for k in ("lat_deg", "lon_deg")):
+        lat, lon = float(place["lat_deg"]), float(place["lon_deg"])
+        facts.append(f"{abs(lat):.4f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.4f}° {'E' if lon >= 0 else 'W'}")
+    return [*facts, " + ".join(PurePath(log).name for log in str(source.summary.get("log", "")).split(" + "))]
+
+
+def _five(source: DiveSource) -> dict[str, str]:
+    """Duration, distance, depth, and the sds of position and heading at the end."""
+    summary, track = source.summary, source.main
+    down = track["down"][np.isfinite(track["down"])]
+    distance = summary.get("distance_m")
+    ends = [_shortest(depth) for depth in (down.min(), down.max())] if len(down) else ["unknown"]
+    heading = float(np.rad2deg(track["yaw_sd"][-1]))
+    wrong = summary.get("verdict") == "wrong"  # the sds are those of a dive that did not happen
+    return {
+        "duration": duration(summary.get("duration_s")),
+        "distance": f"{distance:.4g} m" if isinstance(distance, int | float) else "unknown",
+        "depth": " to ".join(dict.fromkeys(ends)) + (" m" if len(down) else ""),
+        "position sd at the end": "not valid" if wrong else _metres(track.horizontal_sd[-1]),
+        "heading sd at the end": "not valid" if wrong else f"{heading:.2g}°" if np.isfinite(heading) else "unknown",
+    }
+
+
+def _shortest(depth: float) -> str:
+    return f"{abs(depth) if abs(depth) < 0.05 else depth:.1f}"
+
+
+def print_notes(source: DiveSource) -> dict[str, str]:
+    """How the track was made, and by what, for the printed page."""
+    summary = source.summary
+    sensors = [f"{words(name)} ({n['used']})" for name, n in (summary.get("sensors") or {}).items() if n.get("used")]
+    states, first = summary.get("keyframes"), leading(summary.get("assumptions") or [])[0]
+    how = {
+        "smoothed": "Maximum a posteriori estimate over the whole dive (factor graph)",
+        "filtered": "Error-state filter: each time by what came before it",
+    }.get(source.main.kind, "Dead reckoning from velocity and heading")
+    method = f"{how}, {states or len(source.main)} states."
+    if sensors:
+        method += f" Measurements used: {', '.join(sensors)}."
+    versions = {"rovgraph": summary.get("version"), **(summary.get("versions") or {})}
+    signed = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
+    log = summary.get("input") or {}
+    checksum = f"; log {log.get('path')}, SHA-256 {log.get('sha256')}" if log.get("sha256") else ""
+    notes = {"Method": method, "Assumed": "; ".join(first), "Made with": f"{signed}{checksum}"}
+    return {name: text for name, text in notes.items() if text}
 
 
 def how_good(source: DiveSource) -> str:
@@ -264,19 +348,16 @@ def _numbers(source: DiveSource) -> PageTable:
     s = source.summary
     end: dict[str, Any] = s.get("end") or {}
 
-    def value(key: str, unit: str) -> str:
-        number = s.get(key)
-        return f"{number:.4g} {unit}" if isinstance(number, int | float) else "unknown"
-
     def with_sd(name: str, unit: str) -> str:
         short = {"m": "m", "°": "deg"}[unit]
         number, sd = end.get(f"{name}_{short}"), end.get(f"{name}_sd_{short}")
         return plus_minus(np.nan if number is None else number, np.nan if sd is None else sd, unit)
 
+    distance = s.get("distance_m")
     rows = [
         ("log", str(s.get("log", "unknown"))),
-        ("duration", value("duration_s", "s")),
-        ("distance", value("distance_m", "m")),
+        ("duration", duration(s.get("duration_s"))),
+        ("distance", f"{distance:.4g} m" if isinstance(distance, int | float) else "unknown"),
         ("end, north", with_sd("north", "m")),
         ("end, east", with_sd("east", "m")),
         ("end, down", with_sd("down", "m")),
@@ -286,4 +367,6 @@ def _numbers(source: DiveSource) -> PageTable:
 
 
 def _metres(value: float) -> str:
+    if not np.isfinite(value):
+        return "unknown"
     return f"{value:.2g} m" if value < 10 else f"{value:.0f} m"

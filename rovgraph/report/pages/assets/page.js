@@ -35,66 +35,111 @@
     const i = before(times, t), j = Math.min(i + 1, times.length - 1);
     return Math.abs(times[j] - t) < Math.abs(times[i] - t) ? j : i;
   };
-  const number = (v) => (Number.isFinite(v) ? String(Math.abs(v) < 1000 ? +v.toPrecision(4) : +v.toFixed(1)) : "unknown");
-  const metres = (v) => (Number.isFinite(v) ? v.toFixed(2) : "unknown");
+  // A thousandth of what an axis spans is its last digit; less than that is 0.
+  const number = (v, span) => {
+    if (!Number.isFinite(v)) return "unknown";
+    if (!(span > 0)) return String(+v.toPrecision(4));
+    const digits = Math.min(Math.max(3 - Math.ceil(Math.log10(span)), 0), 9);
+    return Math.abs(v) < span / 1000 ? "0" : v.toFixed(digits).replace("-", "−");
+  };
+  const plusMinus = (v, sd) => { // two digits of the sd
+    const digits = Math.min(Math.max(1 - Math.floor(Math.log10(sd)), 0), 9);
+    return `${Math.abs(v) < sd / 1000 ? "0" : v.toFixed(digits).replace("-", "−")} ± ${sd.toFixed(digits)}`;
+  };
+  const spanOf = (axis) => (axis.type === "log" ? NaN : Math.abs(axis.range[1] - axis.range[0]));
+  const unitOf = (label) => (/\[(.+)\]/.exec(label) || ["", ""])[1];
+  const narrow = () => innerWidth < 700;
+  const metres = (v) => (Number.isFinite(v) ? (Math.abs(v) < 0.005 ? 0 : v).toFixed(Math.abs(v) < 100 ? 2 : 1).replace("-", "−") : "unknown");
 
   // ---- drawing -------------------------------------------------------------------------------
   const axis = (title, log, ticks) => ({
     title: { text: title, font: { size: 13 }, standoff: 8 }, automargin: true, zeroline: false, linecolor: "#888",
-    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks,
-    exponentformat: log ? "power" : "none", ...(log ? { dtick: 1 } : {}),
+    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks, exponentformat: "none",
   });
-  const spansDecade = (series, key) => {
+  // Numbers on a logarithmic axis: powers of ten over many decades, 1 2 5 over a few, all digits within one.
+  const logTicks = (series, key) => {
     let low = Infinity, high = 0;
     for (const s of series) for (const v of s[key]) if (v > 0) { low = Math.min(low, v); high = Math.max(high, v); }
-    return high > 20 * low;
+    if (!(high > 0)) return {};
+    const decades = Math.log10(high / low), digits = decades > 3 ? [1] : decades > 0.9 ? [1, 2, 5] : [1, 2, 3, 4, 5, 6, 7, 8, 9];
+    const tickvals = [];
+    for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k++) for (const d of digits) tickvals.push(+`${d}e${k}`);
+    if (tickvals.filter((v) => v >= low && v <= high).length < 2) { // hardly any span: round steps
+      const power = 10 ** Math.floor(Math.log10((high - low) / 2)), step = [5, 2, 1].map((d) => d * power).find((d) => 2 * d <= high - low) || power;
+      tickvals.length = 0;
+      for (let k = Math.ceil(low / step); k * step <= high; k++) tickvals.push(+(k * step).toPrecision(6));
+    }
+    const told = (v) => (v >= 1e-3 && v < 1e5 ? String(v) : v.toExponential(0).replace(/^1e\+?(-?\d+)$/, "10<sup>$1</sup>"));
+    return { tickvals, ticktext: tickvals.map(told), tickmode: "array" };
   };
   const layoutOf = (panel, series) => {
     const plain = (v) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: v, y1: v, line: { color: "#666", width: 1, dash: "dot" } });
     const shaded = ([from, to, colour]) => ({ type: "rect", yref: "paper", y0: 0, y1: 1, x0: from, x1: to,
       fillcolor: colour, opacity: 0.18, line: { width: 0 }, layer: "below" });
     const layout = {
-      margin: { l: 60, r: 12, t: 6, b: 44 }, font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
+      margin: { l: narrow() ? 46 : 60, r: 12, t: 6, b: 44 }, dragmode: narrow() ? false : "zoom", font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
       xaxis: axis(panel.x, panel.log.includes("x"), 12), yaxis: axis(panel.y, panel.log.includes("y"), panel.kind === "map" ? 12 : 6),
-      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.some((t) => t.name && t.showlegend !== false),
+      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.filter((t) => t.name && t.showlegend !== false).length > (panel.kind === "time" || panel.kind === "xy" ? 1 : 0),
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
-    for (const key of panel.log) if (!spansDecade(series, key)) layout[`${key}axis`].dtick = "D1"; // else it has no number
-    if (panel.reach) layout.yaxis.range = [-panel.reach, panel.reach];
+    for (const key of panel.log) Object.assign(layout[`${key}axis`], logTicks(series, key));
+    if (panel.ticks.length) Object.assign(layout.yaxis, { tickvals: panel.ticks });
+    if (panel.limits) layout.yaxis.range = panel.down ? [...panel.limits].reverse() : [...panel.limits];
+    else if (panel.down) layout.yaxis.autorange = "reversed";
+    if (panel.limits && panel.y.startsWith("heading [") && panel.limits[1] - panel.limits[0] > 220)
+      Object.assign(layout.yaxis, { tick0: 0, dtick: 90 });
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
     if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
       range: [panel.names.length + 0.7, 0.3] });
-    if (panel.names.length && panel.log.includes("x")) layout.xaxis.dtick = "D2"; // 2 and 5 too: errors span a decade or two
     if (panel.kind === "map") {
       Object.assign(layout.yaxis, { scaleanchor: "x", scaleratio: 1 });
-      if (data.origin) graticule(layout, null);
+      if (narrow()) { Object.assign(layout, { showlegend: false }); layout.xaxis.nticks = 5; layout.yaxis.nticks = 6; }
+      if (data.origin && !narrow()) graticule(layout, null);
     }
     return layout;
   };
   const traceOf = (panel, trace) => {
-    const digits = panel.kind === "map" ? ".2f" : ".5g";
+    const digits = panel.kind === "map" ? ".2f" : ".4g";
     const arrays = { x: unpack(trace.x), y: unpack(trace.y) };
     if (trace.t) arrays.t = unpack(trace.t);
     if (trace.value) arrays.value = arrays.customdata = unpack(trace.value); // what is told in the place of y
-    const told = `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}}`;
+    if (trace.sd) arrays.sd = unpack(trace.sd);
+    const unit = unitOf(panel.y);
+    const told = panel.kind !== "map" ? `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}} ${unit}`
+      : `east %{x:.2f} m, north %{y:.2f} m${trace.value ? "<br>sd %{customdata:.2g} m" : ""}`;
     const plain = String(trace.name ?? "").replaceAll("&", "&amp;").replaceAll("<", "&lt;"); // Plotly takes tags in names
     return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays, name: plain, label: trace.name };
+  };
+
+  // A line with an sd has a band of so many of them to each side: a closed shape for each part without a gap.
+  const withBand = (s) => {
+    if (!s.sd) return [s];
+    const x = [], y = [], known = (i) => Number.isFinite(s.y[i]) && Number.isFinite(s.sd[i]);
+    for (let from = 0, to; from < s.x.length; from = to + 1) {
+      for (to = from; to < s.x.length && known(to); to++) { x.push(s.x[to]); y.push(s.y[to] + s.band * s.sd[to]); }
+      for (let i = to - 1; i >= from; i--) { x.push(s.x[i]); y.push(s.y[i] - s.band * s.sd[i]); }
+      if (to > from) { x.push(NaN); y.push(NaN); }
+    }
+    const band = { type: "scatter", mode: "lines", name: s.name, x, y, line: { width: 0, color: s.line.color }, fill: "toself",
+      fillcolor: s.line.color + "2e", showlegend: false, legendgroup: s.label, hoverinfo: "skip", quiet: true,
+      label: `${s.label} ± ${s.band} sd` };
+    return [band, { ...s, legendgroup: s.label }];
   };
 
   const draw = async (figure) => {
     const key = figure.dataset.panel;
     if (drawn.has(key)) return;
     const panel = data.panels[key], plot = figure.querySelector(".plot");
-    const series = panel.traces.map((trace) => traceOf(panel, trace));
+    const series = panel.traces.map((trace) => traceOf(panel, trace)).flatMap(withBand);
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
     if (panel.names.length && panel.kind !== "time") plot.style.height = `${110 + 22 * panel.names.length}px`;
-    const options = { responsive: true, displaylogo: false, scrollZoom: false,
+    const options = { responsive: true, displaylogo: false, plotlyServerURL: "", displayModeBar: narrow() ? false : "hover", scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
+      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoom2d", "zoomIn2d", "zoomOut2d", "sendChartToCloud"], modeBarButtonsToAdd: [exportButton(entry)] };
     // an axis shows only where something stands over it
-    const degrees = panel.kind === "map" && data.origin ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
+    const degrees = panel.kind === "map" && data.origin && !narrow() ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
     await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel, series), options);
     plot.querySelectorAll(".modebar-btn").forEach((b) => { b.setAttribute("role", "button"); b.setAttribute("aria-label", b.dataset.title || "tool"); });
     entry.layer = plot.appendChild(document.createElementNS(svg, "svg"));
@@ -131,7 +176,7 @@
   // ---- zoom of all time axes together --------------------------------------------------------
   let following = false;
   const relayout = (entry, change) => {
-    if (entry.panel.kind === "map") { place(entry); if (data.origin && !following) regrid(entry); }
+    if (entry.panel.kind === "map") { place(entry); if (data.origin && !following && entry.plot._fullLayout.xaxis2) regrid(entry); }
     if (following || entry.panel.kind !== "time") return mark(entry);
     if (change["xaxis.autorange"]) return zoom(null);
     if ("xaxis.range[0]" in change) return zoom([change["xaxis.range[0]"], change["xaxis.range[1]"]]);
@@ -169,7 +214,7 @@
     const common = { overlaying: "x", showgrid: true, gridcolor: "#b5c9d6", griddash: "dot", tickfont: { size: 10, color: "#3d5a6c" }, zeroline: false, tickmode: "array", automargin: true };
     layout.xaxis2 = { ...common, side: "top", matches: "x", ...lines(x, o.lon, o.lon_m, "EW", innerWidth < 700 ? 2 : 5) };
     layout.yaxis2 = { ...common, overlaying: "y", side: "right", matches: "y", ...lines(y, o.lat, o.lat_m, "NS", 6) };
-    layout.legend = { orientation: "h", y: -0.12, yanchor: "top", x: 0, font: { size: 12 } };
+    layout.legend = { orientation: "h", y: -0.1, yanchor: "top", x: 0, font: { size: 12 } };
   };
   const regrid = async (entry) => {
     const full = entry.plot._fullLayout, layout = {};
@@ -209,8 +254,15 @@
     const named = (s) => (/\d$/.test(s.label) ? `${s.label}:` : s.label); // a number beside a number
     const near = (xaxis.range[1] - xaxis.range[0]) / 200; // under the mouse; a line is known between its points
     const here = (s) => s.x.length && (s.mode !== "markers" || Math.abs(s.x[nearest(s.x, now)] - now) <= near);
-    const told = entry.series.filter((s) => !s.quiet && here(s)).map((s) => `${named(s)} ${number((s.value || s.y)[nearest(s.x, now)])}`);
-    entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
+    const log = entry.panel.log.includes("y") || entry.panel.ticks.length, span = log ? NaN : spanOf(yaxis), unit = unitOf(entry.panel.y);
+    const tell = (s) => {
+      const i = nearest(s.x, now), value = (s.value || s.y)[i], sd = s.sd ? s.sd[i] : NaN;
+      if (!Number.isFinite(value)) return `${named(s)} unknown`;
+      const shown = sd > 0 ? plusMinus(value, sd) : number(value, s.value ? NaN : span);
+      return `${named(s)} ${shown}${unit === "°" ? "" : unit && " "}${unit}`;
+    };
+    const told = entry.series.filter((s) => !s.quiet && s.visible !== "legendonly" && here(s)).map(tell);
+    entry.readout.textContent = `at ${+now.toFixed(data.clock.unit === "s" ? 1 : 2)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
   };
   const place = (entry) => { // the vehicle with its ellipse, and the scale bar
     if (!entry.layer || !entry.plot._fullLayout.xaxis._length) return;
@@ -265,9 +317,9 @@
     let text = `${now.toFixed(unit === "s" ? 1 : 2)} ${unit}`;
     if (cursor) {
       const v = vehicle(now), heading = (((v.yaw * 180) / Math.PI) % 360 + 360) % 360;
-      text += ` · north ${metres(v.north)} m, east ${metres(v.east)} m, down ${metres(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
-      text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
-      if (data.origin) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
+      text += ` · ${narrow() ? "N" : "north"} ${metres(v.north)} m, ${narrow() ? "E" : "east"} ${metres(v.east)} m, ${narrow() ? "" : "depth "}${metres(v.down)} m ${narrow() ? "deep · " : "· heading "}${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
+      if (!narrow()) text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
+      if (data.origin && !narrow()) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
     }
     output.textContent = text;
     slider.setAttribute("aria-valuetext", text);
@@ -290,7 +342,28 @@
   const seen = new IntersectionObserver((entries) => {
     for (const e of entries) if (e.isIntersecting) { seen.unobserve(e.target); draw(e.target); }
   }, { rootMargin: "400px" });
-  figures.forEach((f) => seen.observe(f));
-  addEventListener("beforeprint", () => figures.forEach(draw));
-  window.rovgraph = { drawn, draw, drawAll: async () => { for (const f of figures) await draw(f); }, setTime, zoom, vehicle };
+  figures.forEach((f) => seen.observe(f)); // one that is folded comes into view when it is opened
+  const unfold = () => {
+    const section = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    const fold = section && section.querySelector(":scope > details.fold");
+    if (fold && !fold.open) { fold.open = true; section.scrollIntoView(); }
+  };
+  addEventListener("hashchange", unfold);
+  document.querySelectorAll("nav a").forEach((a) => a.addEventListener("click", () => setTimeout(unfold)));
+  document.querySelectorAll("details.fold").forEach((d) => d.addEventListener("toggle", () => { // the window may have changed meanwhile
+    if (d.open) for (const entry of drawn.values()) if (d.contains(entry.plot) && entry.layer) Plotly.Plots.resize(entry.plot);
+  }));
+  unfold();
+
+  // ---- the printed page has the map alone ----------------------------------------------------
+  const map = document.getElementById("track");
+  const resizeMap = (size) => { const e = drawn.get("track"); if (e && e.layer) Plotly.relayout(e.plot, size); };
+  addEventListener("beforeprint", () => { if (map && map.dataset.panel) resizeMap({ width: 680, height: 560 }); });
+  addEventListener("afterprint", () => resizeMap({ width: undefined, height: undefined, autosize: true }));
+
+  const drawAll = async () => {
+    document.querySelectorAll("details.fold").forEach((d) => { d.open = true; });
+    for (const f of figures) await draw(f);
+  };
+  window.rovgraph = { drawn, draw, drawAll, setTime, zoom, vehicle };
 })();
