@@ -301,6 +301,9 @@ class Config(ConfigSection):
             raise PydanticCustomError("stated_twice", f"delay_s and online.delay_s both name {twice[0]}; state it once")
         return data | {"online": rest, "delay_s": {**former, **own}}
 
+    def __repr__(self) -> str:
+        return f"<Config {self.name}: states {', '.join(sorted(self.model_fields_set - {'version', 'name'})) or 'nothing'}>"
+
     @property
     def table(self) -> TableSettings:
         """How tables are written that `files` does not name."""

@@ -201,7 +201,7 @@ def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
     if bottom:
         stream = log["dvl_altitude"].take(thin(len(log["dvl_altitude"])))
         altitude, time = stream["dvl_altitude"], clock(stream.time)
-        below = main.trajectory.at(stream.time).p_n[:, 2] + altitude
+        below = main.trajectory.clamped(stream.time).p_n[:, 2] + altitude
         panels[0].plot(time, below, label="bottom", **BOTTOM)
         spans.append(_span(below, np.zeros_like(below)))
         panels[1].plot(time, altitude, **BOTTOM)
@@ -231,7 +231,7 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]
         panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
-        difference = np.rad2deg(wrap_angle(heading - main.trajectory.at(time).rpy[:, 2]))
+        difference = np.rad2deg(wrap_angle(heading - main.trajectory.clamped(time).rpy[:, 2]))
         panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
     names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
     for axes, name in zip(panels, names, strict=False):
@@ -277,7 +277,7 @@ def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tu
     if "mag" in log:
         some = thin(len(log["mag"]), MOST_SAMPLES)
         time = log["mag"].time[some]
-        out["mag"] = (time, _levelled(track.at(time), rotate(R_imu, log["mag"].data[some])) + declination)
+        out["mag"] = (time, _levelled(track.clamped(time), rotate(R_imu, log["mag"].data[some])) + declination)
     return out
 
 
