@@ -186,7 +186,7 @@ class Estimate:
         InputError : of `covariance`
         """
         P, R_nb, seconds = self._joint([first, second], axes)
-        p_n = self.trajectory.at(seconds).p_n
+        p_n = np.stack([np.interp(seconds, self.trajectory.time, axis) for axis in self.trajectory.p_n.T], axis=-1)
         moved, J = p_n[1] - p_n[0], np.zeros((3, 30))
         if axes == "n":
             J[:, POSITION], J[:, 15 + POSITION.start : 15 + POSITION.stop] = -np.eye(3), np.eye(3)
@@ -230,9 +230,10 @@ class Estimate:
         if axes not in _AXES:
             raise InputError(f"axes {axes!r}: expected b or n")
         known, track = self._known(), self.trajectory
-        seconds = np.array([seconds_of_moments(time, track.time, "time") for time in times], dtype=float)
-        if seconds.ndim != 1:
+        each = [seconds_of_moments(time, track.time, "time") for time in times]
+        if any(time.ndim for time in each):
             raise InputError("time: is an array, expected one time; ask for each by itself")
+        seconds = np.array(each, dtype=float)
         first, last = float(track.time[0]), float(track.time[-1])
         outside = seconds[~((seconds >= first) & (seconds <= last))]
         if len(outside):

@@ -36,7 +36,7 @@ from rovgraph.problem.motion import SCALES
 from rovgraph.problem.problem import Index
 
 BLOCK = 64  # keyframes between those whose H and X are kept
-KEPT = 20_000  # keyframes whose conditionals are kept, an hour at 5 Hz: some 7 kB each
+KEPT = 25_000  # keyframes whose conditionals are kept, an hour at 7 Hz: some 7 kB each
 HERE_S = 1e-6  # from a keyframe, within which a time is the keyframe's
 DRAWN = 250_000  # states that are drawn at a time
 
@@ -81,7 +81,7 @@ class ChainMarginals:
         (n, d), c, last = root.conditionals.shape[:2], len(P_y), root.conditionals[-1]
         stops = np.unique(np.append(np.arange(0, n, BLOCK), n - 1))
         H, X, gain = np.empty((len(stops), d, d)), np.empty((len(stops), d, c)), np.empty((len(stops) - 1, d, d))
-        inverse = solve_triangular(last[:, :d], np.eye(d))
+        inverse = np.asarray(np.linalg.inv(last[:, :d]))
         H[-1], X[-1] = inverse @ inverse.T, -inverse @ last[:, 2 * d : 2 * d + c]
         chain_posterior.propagate_back(root.conditionals, stops, H, X, gain)
         return ChainMarginals(root, P_y, stops, H, X, gain)
@@ -133,7 +133,7 @@ class Posterior:
     """The smoothed dive as a normal distribution of all its states, to be asked at any times.
 
     Nothing is computed until it is asked. Conditionals of dives of up to `KEPT` keyframes are kept then; longer dives
-    are eliminated for every question.
+    are eliminated for every question, and H, X and gains are kept.
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class Posterior:
 
     def draw(self, count: int, rng: np.random.Generator) -> Iterator[tuple[State, Array]]:
         """States at the IMU from the distribution, and the displacement of their positions in n, shape (n, 3)."""
-        root, wide, believed = self._marginals().root, self.optimum.wide, self.optimum.believed
+        root, wide, believed = self._marginals().root, self.optimum.wide, self._believed
         n, d, held = len(self.time), wide.layout.d, len(believed)
         free, R = len(root.border) - held, root.border
         known = self._all_displaced(root)
@@ -231,14 +231,19 @@ class Posterior:
             count -= some
 
     def _marginals(self) -> ChainMarginals:
-        if self._kept is not None:
-            return self._kept
+        known = self._kept
+        if known is not None and len(known.root.conditionals):
+            return known
         root = self.optimum.eliminated()
         self.optimum.at_hand = None  # it is kept here, or nowhere
-        made = ChainMarginals.of(root, root.border_covariance(self.optimum.believed))
-        if len(self.time) <= KEPT:
-            self._kept = made
-        return made
+        known = replace(known, root=root) if known else ChainMarginals.of(root, root.border_covariance(self._believed))
+        short = len(self.time) <= KEPT
+        self._kept = known if short else replace(known, root=replace(root, conditionals=root.conditionals[:0].copy()))
+        return known
+
+    @property
+    def _believed(self) -> Array:
+        return self.optimum.believed
 
     def _places(self, times: Array) -> tuple[Index, Array]:
         """Keyframe at each time or before it, and whether the time lies between keyframes."""
@@ -292,7 +297,7 @@ class Posterior:
         own, size = [*range(1, q + 1), 0, q + 1], q * MOTION
         J = np.concatenate([rows[:, :, own].reshape(*rows.shape[:2], -1), by_scale], axis=2)
         R = np.linalg.qr(J.reshape(-1, J.shape[2]), mode="r")[:size]
-        root = solve_triangular(R[:, :size], np.eye(size))
+        root = np.asarray(np.linalg.inv(R[:, :size]))
         gain = (-root @ R[:, size:]).reshape(q, MOTION, -1)
         known = [n for n in SCALES if n in self.optimum.wide.layout.places]
         columns = [2 * MOTION + 3 * SCALES.index(name) + i for name in known for i in range(3)]
@@ -333,7 +338,7 @@ class Posterior:
         """The same at all keyframes, shape (n, 2) each."""
         if not rests_on_doubtful_compass(self.initial):
             return [*self.displaced]
-        P = root.covariances(root.border_covariance(self.optimum.believed))[:, :6, :6]
+        P = root.covariances(root.border_covariance(self._believed))[:, :6, :6]
         R, arm = self.optimum.state.R_nb, skew(np.asarray(self.initial.config.imu.lever_arm_m))
         both = R @ (arm @ P[:, :3, :3] + P[:, 3:, :3]) @ np.swapaxes(R, 1, 2)
         return [displaced_by_heading(both[:, :2, 2]), *self.displaced]
