@@ -15,18 +15,30 @@ from rovgraph.inference.estimate import Estimate, state_names
 from rovgraph.inference.graph.places import smooth_graph
 from rovgraph.inference.graph.values import key
 from rovgraph.inference.posterior import Posterior
+from rovgraph.model.config import beliefs
 from rovgraph.model.state import BIAS, POSE, VELOCITY
 
 AT_IMU = {"imu": {"mount_rpy_deg": [0, 0, 0], "lever_arm_m": [0, 0, 0]}}
+CONSIDERED = {
+    "calibration": {
+        "dvl_yaw": {"estimate": "considered", "sd_deg": 3.0},
+        "dvl_scale": {"estimate": "considered", "sd": 0.02},
+        "dvl_lever_arm": {"estimate": "considered", "sd": 0.05},
+        "depth_offset": {"estimate": "considered", "sd": 0.2},
+        "gyr_scale": {"estimate": "considered", "sd": 0.005},
+    }
+}
 WALKS = {"calibration": {"mag_offset": {"estimate": True, "walk_deg": 0.1}}}
 
 
 @pytest.fixture(scope="module")
 def dive() -> Estimate:
     """A minute with considered variables and an IMU off the origin."""
-    config = falcon(imu={"lever_arm_m": [0.3, -0.2, 0.1]})
+    config = falcon(imu={"lever_arm_m": [0.3, -0.2, 0.1]}, **CONSIDERED)
     case = simulated(config, 60.0, seed=3, imu_rate=50.0)
-    return smoothed(case.log, started(case))
+    estimate = smoothed(case.log, started(case))
+    assert {"dvl_yaw", "dvl_scale"} <= {*estimate.summary["considered"]}
+    return estimate
 
 
 def blocks(P: Array, i: int, j: int) -> Array:
@@ -94,20 +106,32 @@ def test_between_keyframes_it_goes_over_into_those_at_both_ends(dive):
         assert np.abs((dive.covariance(near) - dive.covariance(end)) / np.outer(scale, scale)).to_numpy().max() < 0.02
 
 
-@pytest.mark.parametrize("outage", [0.0, 1.6], ids=["samples", "outage"])
-def test_between_keyframes_it_is_that_of_a_dive_with_a_keyframe_there(outage):
-    case = simulated(falcon(graph={"max_gap_s": 0.9}), 35.0, seed=4, imu_rate=50.0, dvl_rate=1.3, dvl_jitter=0.0)
-    config = changed(started(case), imu={"max_gap_s": 5.0})
-    log = interrupted(case.log, 20.0, outage, "imu") if outage else case.log
-    few, many = (smoothed(log, changed(config, graph={"max_gap_s": gap})) for gap in (0.9, 0.3))
+def test_between_keyframes_it_is_that_of_a_dive_with_a_keyframe_there():
+    sensors = {"imu_rate": 50.0, "dvl_rate": 1.3, "dvl_jitter": 0.0, "depth_rate": None}  # none that counts once in each
+    case = simulated(falcon(heading={"sources": ["dvl"]}), 35.0, seed=4, **sensors)
+    few, many = (smoothed(case.log, changed(started(case), graph={"max_gap_s": gap})) for gap in (0.9, 0.3))
     ours, more = few.trajectory.time, many.trajectory.time
     new = more[(np.abs(more[:, None] - ours).min(axis=1) > 1e-3) & (more > 12.0)]
     assert len(new) > 10
     for t in new[::4]:
         a, b = (one.covariance(t).to_numpy() for one in (few, many))
-        np.testing.assert_allclose(np.sqrt(np.diagonal(a)), np.sqrt(np.diagonal(b)), rtol=0.05)
+        # the noise of an interval is what its samples show, and differs a little
+        np.testing.assert_allclose(np.sqrt(np.diagonal(a)), np.sqrt(np.diagonal(b)), rtol=0.1)
         a, b = (one.relative(t, more[-1]).sd for one in (few, many))
-        np.testing.assert_allclose(a, b, rtol=0.05)
+        np.testing.assert_allclose(a, b, rtol=0.1)
+
+
+def test_within_an_outage_of_the_imu_it_is_wider_than_at_its_ends():
+    case = simulated(falcon(), 40.0, seed=4, imu_rate=50.0)
+    log = interrupted(case.log, 20.0, 1.6, "imu", "dvl")
+    estimate = smoothed(log, changed(started(case), imu={"max_gap_s": 5.0}, graph={"max_gap_s": 3.0}))
+    time = estimate.trajectory.time
+    k = int(np.argmax(np.diff(time)))
+    assert time[k + 1] - time[k] > 1.5
+    begin, middle, end = (
+        np.sqrt(np.diagonal(estimate.covariance(t)))[6:8] for t in (time[k], 0.5 * (time[k] + time[k + 1]), time[k + 1])
+    )
+    assert (middle > 5.0 * np.maximum(begin, end)).all()
 
 
 def test_times_of_one_interval_have_its_noise_in_common(dive):
@@ -206,22 +230,21 @@ def test_other_estimates_have_none(dive):
 @pytest.mark.slow
 def test_400_dives_scatter_as_it_says():
     """With considered variables drawn from their priors, estimated ones too, and a start that is off."""
-    config = falcon(
-        dvl={"loss": "none"}, heading={"loss": "none"}, depth={"loss": "none"}, graph={"find_noise": False}
-    )
-    rng, errors = np.random.default_rng(5), []
-    from rovgraph.model.config import beliefs
-
-    considered = {name: b for name, b in beliefs(config).items() if b.considered}
+    plain = {sensor: {"loss": "none"} for sensor in ("dvl", "heading", "depth")}
+    config, rng, errors = falcon(**plain, **CONSIDERED), np.random.default_rng(5), []
+    considered = {name: belief for name, belief in beliefs(config).items() if belief.considered}
+    assert {*considered} == {*CONSIDERED["calibration"]}
     for seed in range(400):
         drawn = {n: b.mean + b.sd * rng.standard_normal(b.variable.dim) for n, b in considered.items()}
         case = simulated(config, 32.0, seed, calibration=drawn, imu_rate=50.0, dvl_rate=3.0, start_error=True)
         estimate = smoothed(case.log, config)
-        times = np.array([14.321, 30.0])
-        track, truth = estimate.trajectory.at(times), true_at(case, times)
+        assert "dvl_scale" in estimate.summary["considered"]
+        # at keyframes: a track is interpolated between them
+        track = estimate.trajectory[np.searchsorted(estimate.trajectory.time, [14.0, 30.0])]
+        truth = true_at(case, track.time)
         theta = log_rotation(transpose(track.R_nb) @ truth.R_nb)
         p = np.einsum("nji,nj->ni", track.R_nb, truth.p_n - track.p_n)
         e = np.hstack([theta, p, truth.v_n - track.v_n]).ravel()
-        P = estimate.joint(*times).to_numpy()[np.ix_(*[[*range(9), *range(15, 24)]] * 2)]
+        P = estimate.joint(*track.time).to_numpy()[np.ix_(*[[*range(9), *range(15, 24)]] * 2)]
         errors.append(np.linalg.solve(np.linalg.cholesky(P), e))
     is_like(np.array(errors), np.eye(18))

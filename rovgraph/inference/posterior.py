@@ -38,6 +38,7 @@ from rovgraph.problem.problem import Index
 BLOCK = 64  # keyframes between those whose H and X are kept
 KEPT = 25_000  # keyframes whose conditionals are kept, an hour at 7 Hz: some 7 kB each
 HERE_S = 1e-6  # from a keyframe, within which a time is the keyframe's
+LINEARISATIONS = 2  # between keyframes, the first where states are interpolated
 DRAWN = 250_000  # states that are drawn at a time
 
 ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -190,8 +191,10 @@ class Posterior:
                 L[a, :, place[k]] = np.eye(MOTION)
                 states.append(self._state(k, self.time[k : k + 1]))
             if len(own):
-                state = self._state(k, times[own])
-                B, D, Q = self._between(k, times[own], state)
+                state, step = self._state(k, times[own]), np.zeros((len(own), MOTION))
+                for _ in range(LINEARISATIONS):
+                    state = _moved(state, step)
+                    B, D, Q, step = self._between(k, times[own], state)
                 L[own, :, place[k]], L[own, :, place[k + 1]] = B[..., :MOTION], B[..., MOTION:]
                 if D is not None:
                     targets = np.concatenate([layout.target(name) for name in SCALES if name in layout.places])
@@ -254,21 +257,22 @@ class Posterior:
         return before, ~here
 
     def _state(self, k: int, times: Array) -> State:
-        """States at times from keyframe k to the next, interpolated; that is enough to linearise at."""
+        """States at times from keyframe k to the next, interpolated."""
         state, last = self.optimum.state, min(k + 1, len(self.time) - 1)
         share = ((times - self.time[k]) / max(self.time[last] - self.time[k], HERE_S))[:, None]
         turn = log_rotation(state.R_nb[k].T @ state.R_nb[last])
         p, v, bias = (a[k] + share * (a[last] - a[k]) for a in (state.p_n, state.v_n, state.bias))
         return State(state.R_nb[k] @ exp_rotation(share * turn), p, v, bias, {})
 
-    def _between(self, k: int, times: Array, state: State) -> tuple[Array, Array | None, Array]:
-        """States at q times between keyframe k and the next, as these have it, to first order.
+    def _between(self, k: int, times: Array, state: State) -> tuple[Array, Array | None, Array, Array]:
+        """States at q times between keyframe k and the next, as these have it, linearised at some.
 
         Returns
         -------
         B : ndarray, shape (q, 15, 30), derivative by both keyframes
         D : ndarray, shape (q, 15, 6), derivative by the IMU's scales, or None where they are exact
         Q : ndarray, shape (15 q, 15 q), covariance of what the IMU's noise adds
+        step : ndarray, shape (q, 15), to where the IMU has them
         """
         problem, whole, q = self.optimum.wide.problem, self.optimum.state, len(times)
         ends, order = whole.at(slice(k, k + 2)), [0, *range(2, q + 2), 1]
@@ -293,15 +297,17 @@ class Posterior:
         rows = np.zeros((q + 1, MOTION, q + 2, MOTION))
         for a in range(q + 1):
             rows[a, :, a], rows[a, :, a + 1] = W[a] @ A_i[a], W[a] @ A_j[a]
-        by_scale = W @ (A_i + A_j)[..., 9:] @ problem.scales[k] if scaled else np.empty((q + 1, MOTION, 0))
+        by_bias = W @ (A_i + A_j)[..., 9:]
         own, size = [*range(1, q + 1), 0, q + 1], q * MOTION
-        J = np.concatenate([rows[:, :, own].reshape(*rows.shape[:2], -1), by_scale], axis=2)
+        whitened = -W @ r[..., None]
+        J = np.concatenate([rows[:, :, own].reshape(*rows.shape[:2], -1), *([by_bias @ problem.scales[k]] if scaled else []), whitened], axis=2)
         R = np.linalg.qr(J.reshape(-1, J.shape[2]), mode="r")[:size]
         root = np.asarray(np.linalg.inv(R[:, :size]))
-        gain = (-root @ R[:, size:]).reshape(q, MOTION, -1)
+        gain = (-root @ R[:, size:-1]).reshape(q, MOTION, -1)
         known = [n for n in SCALES if n in self.optimum.wide.layout.places]
         columns = [2 * MOTION + 3 * SCALES.index(name) + i for name in known for i in range(3)]
-        return gain[..., : 2 * MOTION], gain[..., columns] if scaled and known else None, root @ root.T
+        by_scale = gain[..., columns] if scaled and known else None
+        return gain[..., : 2 * MOTION], by_scale, root @ root.T, (root @ R[:, -1]).reshape(q, MOTION)
 
     def _at_origin(self, P: Array, times: Array, R_nb: Array, bias: Array) -> Array:
         """From the IMU to the body's origin, as `rovgraph.inference.estimate.body_trajectory` takes states there."""
@@ -342,6 +348,13 @@ class Posterior:
         R, arm = self.optimum.state.R_nb, skew(np.asarray(self.initial.config.imu.lever_arm_m))
         both = R @ (arm @ P[:, :3, :3] + P[:, 3:, :3]) @ np.swapaxes(R, 1, 2)
         return [displaced_by_heading(both[:, :2, 2]), *self.displaced]
+
+
+def _moved(state: State, step: Array) -> State:
+    """States of n epochs moved by steps of shape (n, 15)."""
+    p_n = state.p_n + rotate(state.R_nb, step[:, POSITION])
+    v_n, bias = state.v_n + step[:, VELOCITY], state.bias + step[:, 9:]
+    return State(state.R_nb @ exp_rotation(step[:, ROTATION]), p_n, v_n, bias, state.calibration)
 
 
 def _arrays(state: State) -> tuple[Array, Array, Array, Array]:

@@ -375,8 +375,9 @@ def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 
 def _autopilot_headings(sample: _Sampler, path: Path) -> pd.DataFrame | None:
     """The autopilot's heading, where the configuration names it as a source."""
-    name = "vehicle_heading"
-    return _regular(sample, path, name, 1.0 / COMPASS_RATE) if name in sample.heading_sources else None
+    if "vehicle" not in sample.heading_sources:
+        return None
+    return _regular(sample, path, "vehicle_heading", 1.0 / COMPASS_RATE)
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
