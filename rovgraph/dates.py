@@ -79,7 +79,9 @@ def seconds_of_moments(given: Moments, clock: Array, name: str) -> Array:
         raise InputError(f"{name} {_shown(given)}: expected seconds or a date such as 2026-05-01T09:30:00Z") from None
     if not is_unix(clock):
         begin = f"{float(clock[0]):.10g} s" if len(clock) else "no time"
-        raise InputError(f"{name} {_shown(given)}: is a date, but the track's clock is not Unix time (it begins at {begin})")
+        raise InputError(
+            f"{name} {_shown(given)}: is a date, but the track's clock is not Unix time (it begins at {begin})"
+        )
     return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float).reshape(values.shape)
 
 

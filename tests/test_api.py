@@ -816,3 +816,19 @@ def test_noise_free_data_are_smoothed():
     dive = rg.simulate("lawnmower", seed=2, choices=rg.Choices(duration=40, noise=False))
     result = rg.smooth(dive.log, dive.config, estimate="smoothed")
     assert abs(result.smoothed.trajectory.at(dive.truth.time[-1]).p_n - dive.truth.p_n[-1]).max() < 0.05
+
+
+def test_a_steady_motion_without_noise_is_smoothed_with_a_warning_and_a_dead_gyro_is_refused():
+    ping, rate = SECONDS[::20], np.tile([0.0, 0.0, 0.05], (1000, 1))
+    force = np.tile([0.0, 0.5 * 0.05, -9.80665], (1000, 1))
+    velocity = np.tile([0.5, 0.0, 0.0], (50, 1))
+    others = {"depth": (ping, np.full(50, 5.0)), "heading": (ping, 0.05 * ping)}
+    log = rg.Log.from_arrays(time=SECONDS, acc=force, gyr=rate, dvl=(ping, velocity), **others)
+    with pytest.warns(rg.DataWarning, match="IMU and DVL never change, as simulated without noise"):
+        result = rg.smooth(log, estimate="smoothed")
+    circle = 10.0 * np.array([np.sin(0.05 * ping[-1]), 1.0 - np.cos(0.05 * ping[-1])])
+    assert np.abs(result.smoothed.trajectory.p_n[-1, :2] - circle).max() < 0.02
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (50, 3))
+    alive = rg.Log.from_arrays(time=SECONDS, acc=force, gyr=rate, dvl=(ping, velocity + noise), **others)
+    with pytest.raises(rg.InputError, match="the gyro's values never change; check its connection"):
+        rg.smooth(alive)

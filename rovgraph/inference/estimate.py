@@ -101,7 +101,8 @@ class RelativePosition:
 
     def __repr__(self) -> str:
         shown = ", ".join(
-            f"{axis} {value:.3f} ± {sd:.3f}" for axis, value, sd in zip(_AXES[self.axes], self.value, self.sd, strict=True)
+            f"{axis} {value:.3f} ± {sd:.3f}"
+            for axis, value, sd in zip(_AXES[self.axes], self.value, self.sd, strict=True)
         )
         return f"<RelativePosition {shown} m>"
 
@@ -250,7 +251,11 @@ class Estimate:
 
     def _known(self) -> Posterior:
         if self.posterior is None:
-            why = "places tie its keyframes in loops, or iSAM2 solved it" if self.kind == "smoothed" else "it is no smoother's"
+            why = (
+                "places tie its keyframes in loops, or iSAM2 solved it"
+                if self.kind == "smoothed"
+                else "it is no smoother's"
+            )
             raise InputError(f"the {self.kind} estimate has no joint covariance: {why}")
         return self.posterior
 

@@ -300,7 +300,14 @@ class Posterior:
         by_bias = W @ (A_i + A_j)[..., 9:]
         own, size = [*range(1, q + 1), 0, q + 1], q * MOTION
         whitened = -W @ r[..., None]
-        J = np.concatenate([rows[:, :, own].reshape(*rows.shape[:2], -1), *([by_bias @ problem.scales[k]] if scaled else []), whitened], axis=2)
+        J = np.concatenate(
+            [
+                rows[:, :, own].reshape(*rows.shape[:2], -1),
+                *([by_bias @ problem.scales[k]] if scaled else []),
+                whitened,
+            ],
+            axis=2,
+        )
         R = np.linalg.qr(J.reshape(-1, J.shape[2]), mode="r")[:size]
         root = np.asarray(np.linalg.inv(R[:, :size]))
         gain = (-root @ R[:, size:-1]).reshape(q, MOTION, -1)

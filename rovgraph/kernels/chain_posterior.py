@@ -176,7 +176,12 @@ def propagate_back(conditionals: Matrices, stops: Index, H_out: Matrices, X_out:
         np.zeros((d, width)),
     )
     gain_H, moved_total, transposed = np.zeros((d, width)), np.zeros((d, width)), np.zeros((2 * d, width))
-    factors, T, X, moved = np.zeros((d, 2 * d)), np.zeros((d, padded(c))), np.zeros((d, padded(c))), np.zeros((d, padded(c)))
+    factors, T, X, moved = (
+        np.zeros((d, 2 * d)),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+    )
     for i in range(d):
         total[i, i] = 1.0
         for j in range(d):

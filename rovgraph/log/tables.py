@@ -360,7 +360,9 @@ def tables_of_keywords(given: Mapping[str, Any], time: str, source: str) -> list
     InputError : arrays without times
     """
     own = {name: values for name, values in given.items() if not _has_times(values)}
-    tables: list[Mapping[str, ArrayLike]] = [{time: times[0], name: times[1]} for name, times in given.items() if name not in own]
+    tables: list[Mapping[str, ArrayLike]] = [
+        {time: times[0], name: times[1]} for name, times in given.items() if name not in own
+    ]
     if own and time not in own:
         name = next(iter(own))
         raise InputError(f"{source}: {name} has no times: give {time}=..., or {name}=(times, values)")
