@@ -73,7 +73,7 @@ def seconds_of_moments(given: Moments, clock: Array, name: str) -> Array:
         return values.astype(float)
     try:
         dates = pd.to_datetime(pd.Series(values.ravel()), utc=True, format="ISO8601")
-        if values.dtype.kind not in "OUM" or values.size and dates.isna().all():
+        if values.dtype.kind not in "OUM" or (values.size and dates.isna().all()):
             raise ValueError
     except (ValueError, TypeError, OverflowError):
         raise InputError(f"{name} {_shown(given)}: expected seconds or a date such as 2026-05-01T09:30:00Z") from None

@@ -175,7 +175,7 @@ def test_a_moment_is_a_number_an_array_or_a_date(trajectory):
     with pytest.raises(InputError, match="is a date, but the track's clock is not Unix time"):
         trajectory.at(at)
     for wrong in ("noon", None, {}):
-        with pytest.raises(InputError, match="expected seconds or a date such as 2026-05-01T09:30:00Z$"):
+        with pytest.raises(InputError, match=r"expected seconds or a date such as 2026-05-01T09:30:00Z$"):
             trajectory.at(wrong)
     with pytest.raises(InputError, match=r"^time: has shape \(2, 2\), expected"):
         trajectory.at(np.zeros((2, 2)))
@@ -187,7 +187,7 @@ def test_slices_by_number_and_by_time(trajectory):
     np.testing.assert_array_equal(trajectory[trajectory.time > 0.5].time, trajectory.time[trajectory.time > 0.5])
     some = trajectory.between(trajectory.time[2], trajectory.time[5])
     np.testing.assert_array_equal(some.time, trajectory.time[2:6])
-    with pytest.raises(InputError, match="^no epoch of the track from 1e.06 to 2e.06 s|^no epoch of the track from"):
+    with pytest.raises(InputError, match=r"^no epoch of the track from 1000000\.0 to 2000000\.0 s; the track has"):
         trajectory.between(1e6, 2e6)
     with pytest.raises(IndexError):
         trajectory[len(trajectory)]
@@ -202,7 +202,7 @@ def test_a_dataset_has_units_and_axes(trajectory):
 
 def test_without_xarray_a_line_says_what_to_install(trajectory, monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(InputError, match="^to_xarray: xarray is not installed: pip install xarray$"):
+    with pytest.raises(InputError, match=r"^to_xarray: xarray is not installed: pip install xarray$"):
         trajectory.to_xarray()
 
 

@@ -79,10 +79,12 @@ class Result:
         sd = float(np.nanmax(np.hypot(*track.p_sd[:, :2].T), initial=0.0))
         facts = f"{track.time[-1] - track.time[0]:.0f} s, {track.distance:.0f} m, horizontal sd up to {sd:.2f} m"
         alarms = "".join(f"<li>{escape(alarm.text)}</li>" for alarm in self.alarms)
+        plural = "" if count == 1 else "s"
         return (
-            f'<div style="display:flex;gap:1em;align-items:flex-start">{_map(track.p_n[:, :2])}'
-            f'<div><b style="color:{VERDICT_COLOURS[self.verdict]}">{self.verdict}</b> {escape(Path(self.log.source).name)}'
-            f"<br>{escape(self.main.kind)}: {facts}<br>{count} alarm{'' if count == 1 else 's'}<ul>{alarms}</ul></div></div>"
+            f'<div style="display:flex;gap:1em;align-items:flex-start">{_map(track.p_n[:, :2])}<div>'
+            f'<b style="color:{VERDICT_COLOURS[self.verdict]}">{self.verdict}</b> '
+            f"{escape(Path(self.log.source).name)}<br>{escape(self.main.kind)}: {facts}<br>"
+            f"{count} alarm{plural}<ul>{alarms}</ul></div></div>"
         )
 
     @property

@@ -154,8 +154,8 @@ class Trajectory:
 
         Returns
         -------
-        Trajectory, an epoch for each time, one for a number; NaN beyond the ends, and between epochs of which one is not
-            known
+        Trajectory, an epoch for each time, one for a number; NaN beyond the ends, and between epochs of
+            which one is not known
 
         Raises
         ------

@@ -82,8 +82,8 @@ class Log:
         Parameters
         ----------
         tables : column -> array_like, shape (n,), including ``time``; one table for each clock or rate. ``acc``,
-            ``gyr``, ``mag``, ``dvl`` and ``dvl_water`` of shape (n, 3) stand for their three columns, ``ahrs`` for roll,
-            pitch and yaw, ``fix`` of shape (n, 2) for north and east
+            ``gyr``, ``mag``, ``dvl`` and ``dvl_water`` of shape (n, 3) stand for their three columns, ``ahrs`` for
+            roll, pitch and yaw, ``fix`` of shape (n, 2) for north and east
         config, source : of `from_frame`
         arrays : the same by name: those of ``time``, and pairs (times, values) with times of their own
 

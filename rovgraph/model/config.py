@@ -302,7 +302,8 @@ class Config(ConfigSection):
         return data | {"online": rest, "delay_s": {**former, **own}}
 
     def __repr__(self) -> str:
-        return f"<Config {self.name}: states {', '.join(sorted(self.model_fields_set - {'version', 'name'})) or 'nothing'}>"
+        stated = sorted(self.model_fields_set - {"version", "name"})
+        return f"<Config {self.name}: states {', '.join(stated) or 'nothing'}>"
 
     @property
     def table(self) -> TableSettings:
