@@ -68,7 +68,7 @@ def gap(scenario: str, seeds: int, known: float | None) -> None:
 
 
 def _at(dive: Dive, estimate: Estimate, time: Array) -> tuple[float, float, float]:
-    track = estimate.trajectory.at(time)
+    track = estimate.trajectory.clamped(time)
     e = (track.p_n - dive.path.motion(time).p_n)[:, :2]
     nees = normalised_error(e, track.cov_p[:, :2, :2])[1]
     return float(np.linalg.norm(e[1])), float(np.linalg.norm(e[1] - e[0])), float(nees)

@@ -156,7 +156,7 @@ class Signals:
 
     def _depth_of(self, lever_arm_m: Sequence[float]) -> Array:
         arm = np.subtract(lever_arm_m, self.config.depth.lever_arm_m)
-        return self.depth + rotate(self.attitude.at(self.depth_time).R_nb, arm)[:, 2]
+        return self.depth + rotate(self.attitude.clamped(self.depth_time).R_nb, arm)[:, 2]
 
 
 def _rate(R_nb: Array, rate: float) -> Array:

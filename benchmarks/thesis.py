@@ -106,7 +106,7 @@ def believing(config: Config, **entries: dict[str, Any]) -> Config:
 
 def track_errors(track: Trajectory, truth: Trajectory) -> Row:
     """Horizontal position: rms over the track and at its end [m]; heading, rms [deg]."""
-    true = truth.at(track.time)
+    true = truth.clamped(track.time)
     error = np.linalg.norm((track.p_n - true.p_n)[:, :2], axis=1)
     turn = rotate(true.R_nb, log_rotation(transpose(true.R_nb) @ track.R_nb))[:, 2]
     return {"rms_m": rms(error), "end_m": error[-1], "heading_deg": np.rad2deg(rms(turn))}
@@ -114,7 +114,7 @@ def track_errors(track: Trajectory, truth: Trajectory) -> Row:
 
 def speed_errors(track: Trajectory, truth: Trajectory) -> Array:
     """Length of the error of the velocity in body axes, where the attitude's error is no part of it [mm/s]."""
-    true = truth.at(track.time)
+    true = truth.clamped(track.time)
     error = rotate(transpose(track.R_nb), track.v_n) - rotate(transpose(true.R_nb), true.v_n)
     return np.asarray(1e3 * np.linalg.norm(error, axis=1))
 
@@ -384,7 +384,7 @@ def other_field(case: Case, middle: float) -> Case:
     new = (scale + SCALE * share)[:, None] * field_direction(
         np.full(len(share), declination), dip + np.deg2rad(DIP_DEG) * share
     )
-    R_sn = mount_matrix(config.imu.mount_rpy_deg).T @ transpose(case.truth.at(mag.time).R_nb)
+    R_sn = mount_matrix(config.imu.mount_rpy_deg).T @ transpose(case.truth.clamped(mag.time).R_nb)
     data = mag.data + (config.environment.field_norm or 1.0) * rotate(R_sn, new - old)
     streams = {**case.log.streams, "mag": Stream("mag", mag.columns, mag.time, data, mag.row)}
     return replace(case, log=Log(case.log.source, streams, case.log.origin))

@@ -52,6 +52,44 @@ def is_week(week: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray((known >= WEEKS[0]) & (known <= WEEKS[1]))
 
 
+Moments = Any  # seconds, a date (pandas, datetime, ISO text), or an array of either
+
+
+def seconds_of_moments(given: Moments, clock: Array, name: str) -> Array:
+    """Times that a caller names, by a clock, in the shape that they have [s].
+
+    Parameters
+    ----------
+    given : seconds of the clock; or dates, of pandas, numpy or datetime or as ISO text, in UTC without a zone
+    clock : ndarray, shape (n,), times of the clock [s]
+    name : of the argument, for messages
+
+    Raises
+    ------
+    InputError : neither numbers nor dates; dates for a clock that is not Unix time
+    """
+    values = np.asarray(given)
+    if values.dtype.kind in "iuf" and not isinstance(given, np.timedelta64):
+        return values.astype(float)
+    try:
+        dates = pd.to_datetime(pd.Series(values.ravel()), utc=True, format="ISO8601")
+        if values.dtype.kind not in "OUM" or (values.size and dates.isna().all()):
+            raise ValueError
+    except (ValueError, TypeError, OverflowError):
+        raise InputError(f"{name} {_shown(given)}: expected seconds or a date such as 2026-05-01T09:30:00Z") from None
+    if not is_unix(clock):
+        begin = f"{float(clock[0]):.10g} s" if len(clock) else "no time"
+        raise InputError(
+            f"{name} {_shown(given)}: is a date, but the track's clock is not Unix time (it begins at {begin})"
+        )
+    return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float).reshape(values.shape)
+
+
+def _shown(given: object) -> str:
+    text = str(given).replace("\n", " ")
+    return text if len(text) < 50 else text[:47] + "..."
+
+
 Order = Literal["dmy", "mdy"]
 
 DAY_S = 86400.0

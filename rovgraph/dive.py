@@ -225,13 +225,14 @@ def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, o
 
 def _covering(estimate: Estimate, rivals: Sequence[Rival], best: Optimum) -> Estimate:
     """An estimate whose sd covers where rivals among the explanations put the track."""
-    track = estimate.trajectory
+    track, posterior = estimate.trajectory, estimate.posterior
     cov_p = track.cov_p.copy()
     for rival in rivals:
         if len(rival.p_n) == len(track):
             d = (rival.p_n - best.state.p_n)[:, :2]
             cov_p[:, :2, :2] += d[:, :, None] * d[:, None, :]
-    return replace(estimate, trajectory=replace(track, cov_p=cov_p))
+            posterior = posterior and posterior.also(d)
+    return replace(estimate, trajectory=replace(track, cov_p=cov_p), posterior=posterior)
 
 
 def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[AttitudeGap]) -> dict[tuple[str, str], int]:

@@ -9,8 +9,10 @@ import subprocess
 import sys
 import time
 import warnings
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -722,3 +724,111 @@ def test_what_is_no_path_is_refused_in_one_line(tmp_path, short, result):
             with pytest.raises(rg.InputError, match=r"expected (a path|an address|a results folder).*, found ") as said:
                 use(given)
             assert "\n" not in str(said.value), (name, given)
+
+
+# as researchers expect
+
+
+def test_arrays_of_three_columns_are_those_of_their_columns(short, config):
+    imu = short[short["acc_x"].notna()]
+    dvl = short[short["dvl_vx"].notna()]
+    depth = short[short["depth"].notna()]
+    acc, gyr, v = (
+        imu[[f"acc_{a}" for a in "xyz"]].to_numpy(),
+        imu[[f"gyr_{a}" for a in "xyz"]].to_numpy(),
+        dvl[["dvl_vx", "dvl_vy", "dvl_vz"]].to_numpy(),
+    )
+    named = rg.Log.from_arrays(
+        time=imu["time"], acc=acc, gyr=gyr, dvl=(dvl["time"], v), depth=(depth["time"], depth["depth"]), config=config
+    )
+    tables = rg.Log.from_arrays(
+        {"time": imu["time"], "acc": acc, "gyr": gyr}, {"time": dvl["time"], "dvl": v},
+        {"time": depth["time"], "depth": depth["depth"]}, config=config,
+    )  # fmt: skip
+    whole = rg.Log.from_frame(short, config)
+    for log in (named, tables):
+        assert set(log) == {"imu", "dvl", "depth"}
+        for sensor in log:
+            np.testing.assert_array_equal(log[sensor].time, whole[sensor].time)
+            np.testing.assert_array_equal(log[sensor].data[:, :3], whole[sensor].data[:, :3])
+    assert repr(named).startswith("<Log log: imu ") and repr(named).endswith(" s>")
+
+
+SECONDS = np.arange(0.0, 10.0, 0.01)
+FORCE = np.tile([0.0, 0.0, -9.81], (1000, 1))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "line"),
+    [
+        ({"time": SECONDS, "acc": FORCE[:, :2], "gyr": FORCE}, r"^log: acc has shape \(1000, 2\), expected \(n, 3\)"),
+        ({"time": SECONDS, "acc": FORCE.T, "gyr": FORCE}, r"^log: acc has shape \(3, 1000\), expected \(n, 3\)"),
+        ({"time": SECONDS, "acc": FORCE.astype(complex), "gyr": FORCE}, "^log: acc holds complex128, expected"),
+        ({"time": SECONDS, "acc": FORCE.astype(str), "gyr": FORCE}, "^log: acc holds <U.*, expected numbers$"),
+        ({"time": SECONDS, "acc": FORCE[:-1], "gyr": FORCE}, "^log: columns of different length"),
+        ({"acc": FORCE, "gyr": FORCE}, r"^log: acc has no times: give time=\.\.\., or acc=\(times, values\)$"),
+        ({"time": SECONDS, "acc": np.full((1000, 3), np.nan)}, "no measurement of any sensor in it"),
+    ],
+)  # fmt: skip
+def test_arrays_that_do_not_fit_are_one_line(arrays, line):
+    with pytest.raises(rg.InputError, match=line) as caught:
+        rg.Log.from_arrays(**arrays)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_log_becomes_a_frame_and_comes_back(short, config):
+    log = rg.Log.from_frame(short, config)
+    again = rg.Log.from_frame(log.to_frame())
+    assert list(again) == list(log)
+    for sensor in log:
+        np.testing.assert_array_equal(again[sensor].time, log[sensor].time)
+        np.testing.assert_array_equal(again[sensor].data, log[sensor].data)
+
+
+def test_short_representations(result, config):
+    assert len(repr(config)) < 300 and repr(config).startswith("<Config ")
+    assert repr(rg.Config()) == "<Config rovgraph: states nothing>"
+    for one in (result, result.smoothed, result.smoothed.trajectory, result.log):
+        assert len(repr(one)) < 300 and "\n" not in repr(one)
+
+
+def test_a_notebook_shows_verdict_map_and_alarms_and_no_markup_of_names(result):
+    named = replace(result, log=replace(result.log, source="a/<b>dive</b>.csv"))
+    text = named._repr_html_()
+    assert f">{result.verdict}</b>" in text and "<polyline" in text and "m, north up" in text
+    assert text.count("<li>") == len(result.alarms) and len(text) < 20_000
+    ElementTree.fromstring(text.replace("<br>", "<br/>"))
+    assert "<b>dive" not in text
+
+
+@pytest.mark.parametrize("sources", [["vehicle"], ["dvl"], ["ahrs"], ["ahrs", "vehicle", "mag"]])
+def test_a_simulated_dive_has_the_compasses_of_its_configuration(sources):
+    config = rg.Config().changed(heading={"sources": sources})
+    dive = rg.simulate("lawnmower", config, seed=2, choices=rg.Choices(duration=40))
+    result = rg.smooth(dive.log, dive.config, estimate="smoothed")
+    streams = {"vehicle": "vehicle_heading", "dvl": "dvl_heading"}
+    assert {streams.get(name, name) for name in sources} <= set(result.smoothed.residuals["sensor"])
+    true, found = dive.calibration, result.calibration
+    assert set(found) <= set(true)
+
+
+def test_noise_free_data_are_smoothed():
+    dive = rg.simulate("lawnmower", seed=2, choices=rg.Choices(duration=40, noise=False))
+    result = rg.smooth(dive.log, dive.config, estimate="smoothed")
+    assert abs(result.smoothed.trajectory.at(dive.truth.time[-1]).p_n - dive.truth.p_n[-1]).max() < 0.05
+
+
+def test_a_steady_motion_without_noise_is_smoothed_with_a_warning_and_a_dead_gyro_is_refused():
+    ping, rate = SECONDS[::20], np.tile([0.0, 0.0, 0.05], (1000, 1))
+    force = np.tile([0.0, 0.5 * 0.05, -9.80665], (1000, 1))
+    velocity = np.tile([0.5, 0.0, 0.0], (50, 1))
+    others = {"depth": (ping, np.full(50, 5.0)), "heading": (ping, 0.05 * ping)}
+    log = rg.Log.from_arrays(time=SECONDS, acc=force, gyr=rate, dvl=(ping, velocity), **others)
+    with pytest.warns(rg.DataWarning, match="IMU and DVL never change, as simulated without noise"):
+        result = rg.smooth(log, estimate="smoothed")
+    circle = 10.0 * np.array([np.sin(0.05 * ping[-1]), 1.0 - np.cos(0.05 * ping[-1])])
+    assert np.abs(result.smoothed.trajectory.p_n[-1, :2] - circle).max() < 0.1  # the compass may be off
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (50, 3))
+    alive = rg.Log.from_arrays(time=SECONDS, acc=force, gyr=rate, dvl=(ping, velocity + noise), **others)
+    with pytest.raises(rg.InputError, match="the gyro's values never change; check its connection"):
+        rg.smooth(alive)

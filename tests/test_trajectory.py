@@ -1,6 +1,7 @@
 """A trajectory survives its files, its interpolation and its uncertainty."""
 
 import gzip
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -149,9 +150,63 @@ def test_interpolation_goes_the_short_way_across_south():
     assert abs(wrap_angle(two.at(np.array([0.5])).rpy[0, 2] - np.pi)) < 1e-12
 
 
-def test_interpolation_clamps_outside_and_is_unknown_beside_the_unknown(trajectory):
-    outside = trajectory.at(np.array([-5.0, 1e6]))
-    np.testing.assert_allclose(outside.p_n, trajectory.p_n[[0, -1]])
+def test_beyond_the_ends_there_is_nothing_and_a_warning_says_so(trajectory):
+    begin, end = trajectory.time[[0, -1]]
+    with pytest.warns(DataWarning, match="^2 of 3 times lie beyond the track and give NaN; the track has"):
+        found = trajectory.at([begin - 5.0, begin, end + 1e6])
+    assert np.isnan(found.p_n).all(axis=1).tolist() == [True, False, True]
+    assert np.isnan(found.R_nb[0]).all() and np.isnan(found.cov_p[0]).all()
+    np.testing.assert_array_equal(found.time, [begin - 5.0, begin, end + 1e6])
+    with pytest.warns(DataWarning, match="^1 of 1 times"):
+        assert np.isnan(trajectory.at(np.nan).p_n).all()
+    np.testing.assert_allclose(trajectory.clamped(np.array([-5.0, 1e6])).p_n, trajectory.p_n[[0, -1]])
+
+
+def test_a_moment_is_a_number_an_array_or_a_date(trajectory):
+    number = trajectory.at(float(trajectory.time[3]))
+    np.testing.assert_allclose(number.p_n, trajectory.p_n[3:4])
+    dated = replace(trajectory, time=trajectory.time + 1_777_627_800.0)
+    at = pd.Timestamp(dated.time[3], unit="s").floor("us")
+    naive = at.to_pydatetime()
+    for moment in (at, at.tz_localize("UTC"), naive, at.isoformat(), at.to_datetime64(), [at], pd.DatetimeIndex([at])):
+        np.testing.assert_allclose(dated.at(moment).p_n, trajectory.p_n[3:4], atol=1e-4)
+    zone = at.tz_localize("UTC").tz_convert("Europe/Stockholm")
+    np.testing.assert_allclose(dated.at(zone.isoformat()).p_n, trajectory.p_n[3:4], atol=1e-4)
+    with pytest.raises(InputError, match="is a date, but the track's clock is not Unix time"):
+        trajectory.at(at)
+    for wrong in ("noon", None, {}):
+        with pytest.raises(InputError, match=r"expected seconds or a date such as 2026-05-01T09:30:00Z$"):
+            trajectory.at(wrong)
+    with pytest.raises(InputError, match=r"^time: has shape \(2, 2\), expected"):
+        trajectory.at(np.zeros((2, 2)))
+
+
+def test_slices_by_number_and_by_time(trajectory):
+    np.testing.assert_array_equal(trajectory[2:5].time, trajectory.time[2:5])
+    np.testing.assert_array_equal(trajectory[-1].p_n, trajectory.p_n[-1:])
+    np.testing.assert_array_equal(trajectory[trajectory.time > 0.5].time, trajectory.time[trajectory.time > 0.5])
+    some = trajectory.between(trajectory.time[2], trajectory.time[5])
+    np.testing.assert_array_equal(some.time, trajectory.time[2:6])
+    with pytest.raises(InputError, match=r"^no epoch of the track from 1000000\.0 to 2000000\.0 s; the track has"):
+        trajectory.between(1e6, 2e6)
+    with pytest.raises(IndexError):
+        trajectory[len(trajectory)]
+
+
+def test_a_dataset_has_units_and_axes(trajectory):
+    data = pytest.importorskip("xarray") and trajectory.to_xarray()
+    np.testing.assert_array_equal(data["position"].sel(n="east"), trajectory.p_n[:, 1])
+    assert data["velocity"].attrs["units"] == "m/s" and data.sizes["time"] == len(trajectory)
+    assert data["cov_position"].dims == ("time", "n", "n2")
+
+
+def test_without_xarray_a_line_says_what_to_install(trajectory, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(InputError, match=r"^to_xarray: xarray is not installed: pip install xarray$"):
+        trajectory.to_xarray()
+
+
+def test_interpolation_is_unknown_beside_the_unknown(trajectory):
     trajectory.R_nb[3] = np.nan
     t = trajectory.time
     R = trajectory.at(np.array([t[1], 0.5 * (t[2] + t[3]), t[3], 0.5 * (t[3] + t[4]), t[4]])).R_nb

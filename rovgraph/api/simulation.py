@@ -11,6 +11,7 @@ from rovgraph.errors import as_path
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.lab.evaluate import Metrics, evaluate, read_reference
 from rovgraph.log import Log
+from rovgraph.model.calibration import TABLE
 from rovgraph.model.config import Config, load_config
 from rovgraph.process import Progress, no_progress
 from rovgraph.simulate import Choices, Dive, simulated
@@ -49,6 +50,16 @@ class SimulatedDive:
     def truth(self) -> Trajectory:
         """The true motion."""
         return self.dive.truth
+
+    @property
+    def calibration(self) -> dict[str, float]:
+        """Label of each scalar component -> its true value, SI and radians: what `Result.calibration` estimates."""
+        known = self.dive.hidden["calibration"]
+        return {
+            label: float(value)
+            for name, values in known.items()
+            for label, value in zip(TABLE[name].labels, values, strict=True)
+        }
 
     @property
     def figures(self) -> dict[str, Any]:

@@ -3,14 +3,18 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rovgraph.api.logs import config_of, prepared
 from rovgraph.diagnosis import Alarm, Verdict
 from rovgraph.dive import DiveEstimates
 from rovgraph.dive import smooth as smooth_dive
 from rovgraph.errors import InputError, as_path, as_texts, collected_warnings
+from rovgraph.geometry import Array
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.log import Log
 from rovgraph.model.config import Config
@@ -20,6 +24,33 @@ from rovgraph.report.export.track import ESTIMATES as TRACKS
 
 ENGINES = ("batch", "isam2")
 ESTIMATES = ("smoothed", "filtered", "both")
+
+
+VERDICT_COLOURS = {"trusted": "#00795a", "doubtful": "#b45309", "wrong": "#b91c1c"}
+MAP_PX, MAP_POINTS = 200, 400
+
+
+def _map(p_n: Array) -> str:
+    """A track of shape (n, 2), north and east, as an SVG picture with its length of side."""
+    known = p_n[np.isfinite(p_n).all(axis=1)]
+    if not len(known):
+        return ""
+    some = known[np.unique(np.linspace(0, len(known) - 1, MAP_POINTS).astype(int))]
+    side = max(float(np.ptp(some, axis=0).max()), 1e-3)
+    middle, scale = 0.5 * (some.max(axis=0) + some.min(axis=0)), 0.9 * MAP_PX / side
+    north, east = ((some - middle) * scale).T
+    x, y = 0.5 * MAP_PX + east, 0.5 * MAP_PX - north
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    ends = "".join(
+        f'<circle cx="{x[k]:.1f}" cy="{y[k]:.1f}" r="4" fill="{colour}"><title>{name}</title></circle>'
+        for k, colour, name in ((0, "#0072b2", "begin"), (-1, "#d55e00", "end"))
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{MAP_PX}" height="{MAP_PX}" role="img" '
+        f'aria-label="track, {side:.0f} m wide, north up" style="background:#fff;border:1px solid #ccc">'
+        f'<polyline points="{points}" fill="none" stroke="#333" stroke-width="1.5"/>{ends}'
+        f'<text x="4" y="{MAP_PX - 4}" font-size="10" fill="#333">{side:.0f} m, north up</text></svg>'
+    )
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,6 +72,20 @@ class Result:
 
     def __repr__(self) -> str:
         return f"<Result of {self.log.source}: {self.verdict}, {len(self.alarms)} alarms>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the verdict, the alarms and a small map of the main track, north up."""
+        track, count = self.main.trajectory, len(self.alarms)
+        sd = float(np.nanmax(np.hypot(*track.p_sd[:, :2].T), initial=0.0))
+        facts = f"{track.time[-1] - track.time[0]:.0f} s, {track.distance:.0f} m, horizontal sd up to {sd:.2f} m"
+        alarms = "".join(f"<li>{escape(alarm.text)}</li>" for alarm in self.alarms)
+        plural = "" if count == 1 else "s"
+        return (
+            f'<div style="display:flex;gap:1em;align-items:flex-start">{_map(track.p_n[:, :2])}<div>'
+            f'<b style="color:{VERDICT_COLOURS[self.verdict]}">{self.verdict}</b> '
+            f"{escape(Path(self.log.source).name)}<br>{escape(self.main.kind)}: {facts}<br>"
+            f"{count} alarm{plural}<ul>{alarms}</ul></div></div>"
+        )
 
     @property
     def smoothed(self) -> Estimate:

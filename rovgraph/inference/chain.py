@@ -218,6 +218,10 @@ class Chain:
         places = {name: self.problem.of_sensor(name) for name in names}
         return {name: found for name, found in places.items() if len(found)}
 
+    def __getstate__(self) -> dict[str, object]:
+        """For pickle: without the costs of the newest points, whose points it cannot refer to."""
+        return {name: value for name, value in self.__dict__.items() if name != "_newest"}
+
     # what `rovgraph.inference.gauss_newton` asks
 
     def seen(self, state: State, blocks: Mapping[str, Measurements]) -> Seen:

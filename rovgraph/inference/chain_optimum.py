@@ -197,7 +197,7 @@ class ChainOptimum:
         return widened(self.chain, self.state, names) if names else self.chain
 
     @cached_property
-    def _believed(self) -> Array:
+    def believed(self) -> Array:
         """Covariance of what is considered, shape (h, h)."""
         beliefs = [self.beliefs[name] for name in self.unknowns.considered]
         return np.diag(np.concatenate([np.empty(0), *(np.full(b.variable.dim, b.sd**2) for b in beliefs)]))
@@ -216,7 +216,7 @@ class ChainOptimum:
         if root is None:
             root = self.wide.eliminate(self.linearised_at, self.solution.gates)
             if self.begun is not None:
-                root.move_to(root.solve(len(self._believed))[1])
+                root.move_to(root.solve(len(self.believed))[1])
         self.at_hand = root
         _ = self._end, self.linear  # they need little of it
         if len(self.problem) > SHORT:
@@ -234,7 +234,7 @@ class ChainOptimum:
     @cached_property
     def linear(self) -> tuple[float, float]:
         """Log determinant of the information of what is estimated, and its least sum of squares."""
-        held, gates = len(self._believed), self.solution.gates
+        held, gates = len(self.believed), self.solution.gates
         root = self.at_hand or self.wide.eliminate(self.linearised_at, gates, diagonal=True)
         return root.log_determinant(held), root.least(held)
 
@@ -262,7 +262,7 @@ class ChainOptimum:
 
     def _last_step(self) -> "tuple[float, float, ChainStep, ChainOptimum | None]":
         """Predicted and actual decrease of the step from here, the step, and the optimum there if it has converged."""
-        root, held, known = self.eliminated(), len(self._believed), self.solution
+        root, held, known = self.eliminated(), len(self.believed), self.solution
         promised, (x, y) = root.explained(held), root.solve(held)
         step = ChainStep(x, y)
         point = self.wide.moved(self.state, step, 1.0)
@@ -301,16 +301,16 @@ class ChainOptimum:
 
     def sd_of_noise(self) -> dict[str, Array]:
         """The sd of estimated constants if all considered ones were known: name -> ndarray, shape (dim,)."""
-        P, places = self._end.border_covariance(0.0 * self._believed), self.wide.layout.places
+        P, places = self._end.border_covariance(0.0 * self.believed), self.wide.layout.places
         border = [name for name in self.unknowns.estimated if places[name][0]]
         return {name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) for name in border}
 
     def moved_by_considered(self) -> Iterator[State]:
         """The optimum with each considered component one sd away, and the estimated variables following it."""
-        root, held = self.eliminated(), len(self._believed)
+        root, held = self.eliminated(), len(self.believed)
         for k in range(held):
             y = np.zeros(len(root.border))
-            y[len(y) - held + k] = np.sqrt(self._believed[k, k])
+            y[len(y) - held + k] = np.sqrt(self.believed[k, k])
             y = root.border_with(np.arange(len(y) - held), y, unforced=True)
             x = np.zeros_like(root.conditionals[:, :, -1:])
             back_substitute(root.conditionals, y[:, None], x)
@@ -330,7 +330,7 @@ class ChainOptimum:
 
     def covariances(self) -> dict[str, Array]:
         """As `rovgraph.inference.optimum.Optimum`."""
-        root, P_y = self.eliminated(), self._end.border_covariance(self._believed)
+        root, P_y = self.eliminated(), self._end.border_covariance(self.believed)
         P = root.covariances(P_y) if len(self.problem) <= SHORT else root.turn_into_covariances(P_y)
         out = {name: P[:, own, own] for name, own in COLUMNS.items()}
         for name, (border, own) in self.wide.layout.places.items():
@@ -341,7 +341,7 @@ class ChainOptimum:
         """As `rovgraph.inference.optimum.Optimum`."""
         layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
         chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
-        newest = self._end.newest_covariance(self._end.border_covariance(self._believed))
+        newest = self._end.newest_covariance(self._end.border_covariance(self.believed))
         return np.asarray(newest[np.ix_(chosen, chosen)])
 
     @cached_property
@@ -384,7 +384,7 @@ class ChainOptimum:
         wide = self.wide
         root, layout = wide.eliminate(point, self.solution.gates, keyframes, kept=1), wide.layout
         held = [int(k) for name in self.unknowns.considered for k in layout.target(name)]
-        P = root.filtered_covariances(held, self._believed)
+        P = root.filtered_covariances(held, self.believed)
         attitude = layout.d + layout.c + np.arange(3)
         calibration = [layout.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])

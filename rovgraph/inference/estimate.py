@@ -8,9 +8,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from rovgraph.dates import Moments, seconds_of_moments
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.inference.assumptions import rests_on_doubtful_compass
 from rovgraph.inference.observability import verdict
+from rovgraph.inference.posterior import POSITION, ROTATION, Posterior, displaced_by_heading
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels.assembly import RATE_B, SPREAD, TIME
 from rovgraph.model.calibration import CONSIDERED, TABLE, Belief
@@ -66,6 +69,44 @@ class CalibrationEstimate:
     verdict: str = ""
 
 
+_AXES = {"b": ("x", "y", "z"), "n": ("north", "east", "down")}
+
+
+def state_names(axes: str = "b") -> tuple[str, ...]:
+    """Names of the 15 components of a state's error, rotation and position in axes of b or n."""
+    own, n, b = _AXES[axes], _AXES["n"], _AXES["b"]
+    parts = ("rotation", own), ("position", own), ("velocity", n), ("acc_bias", b), ("gyr_bias", b)
+    return tuple(f"{quantity}_{axis}" for quantity, axes_of in parts for axis in axes_of)
+
+
+@dataclass(frozen=True)
+class RelativePosition:
+    """The position of a moment relative to another one.
+
+    Attributes
+    ----------
+    axes : "n", or "b" for the body's axes at the other moment
+    value : ndarray, shape (3,) [m]
+    covariance : ndarray, shape (3, 3) [m^2]
+    """
+
+    axes: str
+    value: Array
+    covariance: Array
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviation of its components, shape (3,) [m]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def __repr__(self) -> str:
+        shown = ", ".join(
+            f"{axis} {value:.3f} ± {sd:.3f}"
+            for axis, value, sd in zip(_AXES[self.axes], self.value, self.sd, strict=True)
+        )
+        return f"<RelativePosition {shown} m>"
+
+
 @dataclass(frozen=True, repr=False)
 class Estimate:
     """A trajectory, the calibration and the residuals of the measurements.
@@ -80,6 +121,7 @@ class Estimate:
     residuals : columns `RESIDUAL_COLUMNS`; component is x, y, z or a name, normalised is
         innovation / sd, weight is 1 for a full measurement and 0 for a rejected one
     summary : numbers about the solution, ready for JSON
+    posterior : of a smoothed estimate of the chain: what `covariance`, `joint`, `relative` and `sample` come from
     """
 
     kind: str
@@ -88,9 +130,134 @@ class Estimate:
     history: dict[str, History]
     residuals: pd.DataFrame
     summary: dict[str, Any] = field(default_factory=dict)
+    posterior: Posterior | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         return f"<Estimate, {self.kind}: {self.trajectory!r}>"
+
+    def covariance(self, time: Moments, axes: str = "b") -> pd.DataFrame:
+        """Covariance of the whole state at a time, between keyframes too.
+
+        The state is that of the body's origin: rotation [rad], position [m], velocity [m/s], accelerometer bias
+        [m/s^2] and gyro bias [rad/s]. The errors are those of GTSAM's tangent space: ``R_nb <- R_nb Exp(rotation)``,
+        ``p_n <- p_n + R_nb position`` in body axes, velocity in n, biases in body axes. What is considered counts with
+        its prior.
+
+        Parameters
+        ----------
+        time : [s], or a date where the log's clock is Unix time
+        axes : "b" as above; "n" for rotation and position in n, as the trajectory's ``cov_theta`` and ``cov_p`` are
+
+        Returns
+        -------
+        DataFrame, shape (15, 15), with the components' names; ``to_numpy()`` gives the matrix
+
+        Raises
+        ------
+        InputError : a time beyond the track, other axes, an estimate without a joint covariance
+        """
+        P = self._joint([time], axes)[0]
+        names = pd.Index(state_names(axes))
+        return pd.DataFrame(P, names, names)
+
+    def joint(self, first: Moments, second: Moments, axes: str = "b") -> pd.DataFrame:
+        """Joint covariance of the states at two times, in either order; parameters and errors are of `covariance`.
+
+        Returns
+        -------
+        DataFrame, shape (30, 30), with the names of `covariance` under 1 for the first time and 2 for the second:
+            ``joint.loc[1, 2]`` is the covariance of the first with the second
+        """
+        P = self._joint([first, second], axes)[0]
+        names = pd.MultiIndex.from_product([(1, 2), state_names(axes)], names=("time", "component"))
+        return pd.DataFrame(P, names, names)
+
+    def relative(self, first: Moments, second: Moments, axes: str = "n") -> RelativePosition:
+        """Position at the second time relative to the first, with its uncertainty.
+
+        What both have in common, such as where the dive began, is not in it.
+
+        Parameters
+        ----------
+        first, second : as ``time`` of `covariance`
+        axes : "n", or "b" for the body's axes at the first time, whose attitude is uncertain too
+
+        Raises
+        ------
+        InputError : of `covariance`
+        """
+        P, R_nb, seconds = self._joint([first, second], axes)
+        p_n = np.stack([np.interp(seconds, self.trajectory.time, axis) for axis in self.trajectory.p_n.T], axis=-1)
+        moved, J = p_n[1] - p_n[0], np.zeros((3, 30))
+        if axes == "n":
+            J[:, POSITION], J[:, 15 + POSITION.start : 15 + POSITION.stop] = -np.eye(3), np.eye(3)
+            return RelativePosition(axes, moved, J @ P @ J.T)
+        value = R_nb[0].T @ moved
+        J[:, ROTATION], J[:, POSITION] = skew(value), -np.eye(3)
+        J[:, 15 + POSITION.start : 15 + POSITION.stop] = R_nb[0].T @ R_nb[1]
+        return RelativePosition(axes, value, J @ P @ J.T)
+
+    def sample(self, count: int, seed: int | None = None) -> list[Trajectory]:
+        """Draws of the whole trajectory, at its epochs: tracks that the data leave possible.
+
+        Constants are drawn with them, considered ones from their priors.
+
+        Parameters
+        ----------
+        count : how many
+        seed : for the same draws again; None = others each time
+
+        Returns
+        -------
+        list of Trajectory, without uncertainty of their own
+
+        Raises
+        ------
+        InputError : a count below 1, an estimate without a joint covariance
+        """
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise InputError(f"count {count!r}: expected a whole number from 1")
+        known, rng = self._known(), np.random.default_rng(seed)
+        problem, out = known.optimum.problem, []
+        arm = skew(np.asarray(known.initial.config.imu.lever_arm_m))
+        for states, moved in known.draw(int(count), rng):
+            one = body_trajectory(problem.keyframes, states, known.initial)
+            turned = rng.standard_normal((len(problem), 3)) * problem.rate_sd[:, None] @ arm.T
+            out.append(Trajectory.certain(one.time, one.p_n + moved, one.R_nb, one.v_n + rotate(one.R_nb, turned)))
+        return out
+
+    def _joint(self, times: Sequence[Moments], axes: str) -> tuple[Array, Array, Array]:
+        """Joint covariance at some times, shape (15 q, 15 q), attitudes and times [s]."""
+        if axes not in _AXES:
+            raise InputError(f"axes {axes!r}: expected b or n")
+        known, track = self._known(), self.trajectory
+        each = [seconds_of_moments(time, track.time, "time") for time in times]
+        if any(time.ndim for time in each):
+            raise InputError("time: is an array, expected one time; ask for each by itself")
+        seconds = np.array(each, dtype=float)
+        first, last = float(track.time[0]), float(track.time[-1])
+        outside = seconds[~((seconds >= first) & (seconds <= last))]
+        if len(outside):
+            raise InputError(f"time {outside[0]:.10g} s: beyond the track, which has {first:.10g} to {last:.10g} s")
+        P, R_nb = known.at(seconds)
+        if axes == "n":
+            turn = np.eye(len(P))
+            for a, R in enumerate(R_nb):
+                for part in (ROTATION, POSITION):
+                    rows = slice(15 * a + part.start, 15 * a + part.stop)
+                    turn[rows, rows] = R
+            P = turn @ P @ turn.T
+        return P, R_nb, seconds
+
+    def _known(self) -> Posterior:
+        if self.posterior is None:
+            why = (
+                "places tie its keyframes in loops, or iSAM2 solved it"
+                if self.kind == "smoothed"
+                else "it is no smoother's"
+            )
+            raise InputError(f"the {self.kind} estimate has no joint covariance: {why}")
+        return self.posterior
 
 
 _XYZ = ("_x", "_y", "_z")
@@ -153,8 +320,8 @@ def second_order(cov_p_heading: Array) -> Array:
     ----------
     cov_p_heading : ndarray, shape (n, 2), covariance of north and east with the heading [m rad]
     """
-    along = cov_p_heading[:, ::-1] * (1.0, -1.0)
-    return np.asarray(0.75 * along[:, :, None] * along[:, None, :])
+    along = displaced_by_heading(cov_p_heading)
+    return np.asarray(along[:, :, None] * along[:, None, :])
 
 
 def calibration_estimates(

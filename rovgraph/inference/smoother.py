@@ -27,6 +27,7 @@ from rovgraph.inference.initialise import unseen
 from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, with_arm_of_rates
 from rovgraph.inference.observability import shown, shown_below, without_what_noise_moves
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
+from rovgraph.inference.posterior import Posterior
 from rovgraph.log import Log
 from rovgraph.model.state import BIAS, PLACE, POSE, VELOCITY, State
 from rovgraph.problem.admission import TimeOffsets
@@ -250,6 +251,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "held_at_prior": held,
             "considered": [name for name in best.unknowns.considered if name not in held],
         },
+        Posterior.of(best, b) if isinstance(best, ChainOptimum) else None,
     )
 
 

@@ -9,16 +9,20 @@ tools such as ``evo_ape``.
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.dates import YEAR_FIRST, DateRules, is_unix
+from rovgraph.dates import YEAR_FIRST, DateRules, Moments, is_unix, seconds_of_moments
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
+
+if TYPE_CHECKING:
+    import xarray
 
 FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
 TUM = ".ned.tum"  # end of the name of a TUM file, with its frame
@@ -114,14 +118,68 @@ class Trajectory:
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
         """Some of its epochs, by index or by mask."""
+        return self[index]
+
+    def __getitem__(self, index: int | slice | NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
+        """Some of its epochs, by number, slice, indices or mask: ``track[10:20]``; one number gives one epoch."""
+        if isinstance(index, int | np.integer):
+            at = range(len(self))[index]  # IndexError, where it has none
+            index = slice(at, at + 1)
         return Trajectory(*(getattr(self, f.name)[index] for f in fields(self)))
 
-    def at(self, time: Array) -> "Trajectory":
-        """Interpolated to ``time`` (linear; rotations along the shortest arc).
+    def between(self, first: Moments, last: Moments) -> "Trajectory":
+        """The epochs from one time to another, both included.
 
-        Epochs outside the trajectory are clamped to its ends. Between epochs of which one
-        is not known the result is NaN.
+        Parameters
+        ----------
+        first, last : [s], or dates where the track's clock is Unix time
+
+        Raises
+        ------
+        InputError : neither times nor dates, no epoch between them
         """
+        begin, end = (seconds_of_moments(time, self.time, "time") for time in (first, last))
+        found = self[(self.time >= begin) & (self.time <= end)]
+        if not len(found):
+            raise InputError(f"no epoch of the track from {begin} to {end} s; {_span(self.time)}")
+        return found
+
+    def at(self, time: Moments) -> "Trajectory":
+        """Interpolated to some times (linear; rotations along the shortest arc).
+
+        Parameters
+        ----------
+        time : a number or an array [s]; or dates where the track's clock is Unix time: of pandas, numpy or datetime or
+            as ISO text, in UTC without a zone
+
+        Returns
+        -------
+        Trajectory, an epoch for each time, one for a number; NaN beyond the ends, and between epochs of
+            which one is not known
+
+        Raises
+        ------
+        InputError : neither numbers nor dates, more than one dimension, dates where the clock is not Unix time
+
+        Warns
+        -----
+        DataWarning : times beyond the ends
+        """
+        at = np.atleast_1d(seconds_of_moments(time, self.time, "time"))
+        if at.ndim > 1:
+            raise InputError(f"time: has shape {at.shape}, expected a number or one dimension")
+        outside = ~((at >= self.time[0]) & (at <= self.time[-1]))
+        found = self.clamped(np.where(np.isnan(at), self.time[0], at))
+        if outside.any():
+            warn(f"{int(outside.sum())} of {len(at)} times lie beyond the track and give NaN; {_span(self.time)}")
+            values = {f.name: getattr(found, f.name) for f in fields(found)}
+            for value in values.values():
+                value[outside] = np.nan
+            found = Trajectory(**values | {"time": at})
+        return found
+
+    def clamped(self, time: Array) -> "Trajectory":
+        """As `at`, of numbers; beyond the ends the track stands still."""
         t = np.clip(time, self.time[0], self.time[-1])
 
         def linear(x: Array) -> Array:
@@ -131,7 +189,7 @@ class Trajectory:
 
         R_nb = _slerp(self.time, self.R_nb, t)
         covariances = linear(self.cov_p), linear(self.cov_theta), linear(self.cov_v)
-        return Trajectory(np.asarray(time, float), linear(self.p_n), R_nb, linear(self.v_n), *covariances)
+        return Trajectory(np.array(time, float), linear(self.p_n), R_nb, linear(self.v_n), *covariances)
 
     def columns(self) -> dict[str, Array]:
         """The columns of the contract, each of shape (n,)."""
@@ -143,6 +201,32 @@ class Trajectory:
     def to_frame(self) -> pd.DataFrame:
         """The columns of the contract, one row per epoch."""
         return pd.DataFrame(self.columns())
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The same as an xarray Dataset along ``time``, with units; axes are ``n`` and ``b``.
+
+        Raises
+        ------
+        InputError : xarray is not installed
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise InputError("to_xarray: xarray is not installed: pip install xarray") from None
+        n, b, t = ("n", ["north", "east", "down"]), ("b", ["forward", "starboard", "down"]), "time"
+        matrix = (t, "n", "n2")
+        variables = {
+            "position": ((t, "n"), self.p_n, "m"),
+            "velocity": ((t, "n"), self.v_n, "m/s"),
+            "rpy": ((t, "angle"), self.rpy, "rad"),
+            "R_nb": ((t, "n", "b"), self.R_nb, "1"),
+            "cov_position": (matrix, self.cov_p, "m^2"),
+            "cov_rotation": (matrix, self.cov_theta, "rad^2"),
+            "cov_velocity": (matrix, self.cov_v, "m^2/s^2"),
+        }
+        made = {name: (dims, value, {"units": unit}) for name, (dims, value, unit) in variables.items()}
+        coords = {t: (t, self.time, {"units": "s"}), n[0]: n[1], "n2": n[1], b[0]: b[1], "angle": ATTITUDE}
+        return xarray.Dataset(made, coords)
 
     def geodetic(self, origin: tuple[float, float]) -> tuple[Array, Array]:
         """Latitude and longitude [deg], each of shape (n,).
@@ -192,6 +276,10 @@ class Trajectory:
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
         poses = line * len(rows) % tuple(rows.ravel().tolist())
         as_path(path, "path").write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
+
+
+def _span(time: Array) -> str:
+    return f"the track has {float(time[0]):.10g} to {float(time[-1]):.10g} s" if len(time) else "the track is empty"
 
 
 def _sd(covariance: Array) -> Array:

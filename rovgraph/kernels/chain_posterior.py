@@ -12,7 +12,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.chain import padded
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import Index, Matrices, helper, kernel
 
 
 @kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
@@ -151,3 +151,70 @@ def covariances(conditionals: Array, P_y: Array, P_out: Array, cross_out: Array,
             for i in range(d):
                 for j in range(d):
                     next_out[k, i, j] = by_border[i, width + j] - gain_H[i, j]
+
+
+@kernel()
+def propagate_back(conditionals: Matrices, stops: Index, H_out: Matrices, X_out: Matrices, gain_out: Matrices) -> None:
+    """`covariances` at a few keyframes, and what ties them: with a held border, dx_i/dx_j = G_i G_{i+1} ... G_{j-1}.
+
+    With G_k = -R^-1 S, the covariance of keyframes i <= j is G_i ... G_{j-1} H_j + X_i P_y X_j'.
+
+    Parameters
+    ----------
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.elimination.eliminate`
+    stops : shape (s,), increasing, the keyframes
+    H_out, X_out : shapes (s, d, d), (s, d, c), given at the last stop
+    gain_out : shape (s - 1, d, d), of a stop by the next
+    """
+    d, c, stop = H_out.shape[1], X_out.shape[2], len(stops) - 1
+    width = padded(d)
+    inverse, S, gain, H, total = (
+        np.zeros((d, width)),
+        np.zeros((d, width)),
+        np.zeros((d, width)),
+        np.zeros((d, width)),
+        np.zeros((d, width)),
+    )
+    gain_H, moved_total, transposed = np.zeros((d, width)), np.zeros((d, width)), np.zeros((2 * d, width))
+    factors, T, X, moved = (
+        np.zeros((d, 2 * d)),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+    )
+    for i in range(d):
+        total[i, i] = 1.0
+        for j in range(d):
+            H[i, j] = H_out[stop, i, j]
+        for j in range(c):
+            X[i, j] = X_out[stop, i, j]
+    for k in range(stops[stop] - 1, stops[0] - 1, -1):
+        invert_triangle(conditionals[k], inverse)
+        for i in range(d):
+            for j in range(d):
+                S[i, j] = -conditionals[k, i, d + j]
+            for j in range(c):
+                T[i, j] = -conditionals[k, i, 2 * d + j]
+        multiply_padded(inverse, S, d, True, gain)
+        multiply_padded(gain, H, d, False, gain_H)
+        for i in range(d):
+            for j in range(d):
+                factors[i, j], factors[i, d + j] = inverse[i, j], gain_H[i, j]
+                transposed[j, i], transposed[d + j, i] = inverse[i, j], gain[i, j]
+        multiply_padded(factors, transposed, 2 * d, True, H)
+        multiply_padded(gain, X, d, False, moved)
+        multiply_padded(inverse, T, d, True, X)
+        multiply_padded(gain, total, d, False, moved_total)
+        for i in range(d):
+            for j in range(c):
+                X[i, j] += moved[i, j]
+            for j in range(d):
+                total[i, j] = moved_total[i, j]
+        if k == stops[stop - 1]:
+            stop -= 1
+            for i in range(d):
+                for j in range(d):
+                    H_out[stop, i, j], gain_out[stop, i, j] = 0.5 * (H[i, j] + H[j, i]), total[i, j]
+                    total[i, j] = 1.0 if i == j else 0.0
+                for j in range(c):
+                    X_out[stop, i, j] = X[i, j]

@@ -144,7 +144,7 @@ def _common(track: Trajectory, reference: Trajectory) -> Array:
 def _velocity_rms(track: Trajectory, reference: Trajectory) -> float | None:
     """Horizontal, where the reference has a velocity [m/s]."""
     time = _common(track, reference)
-    error = (track.at(time).v_n - reference.at(time).v_n)[:, :2]
+    error = (track.clamped(time).v_n - reference.clamped(time).v_n)[:, :2]
     known = error[np.isfinite(error).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else None
 
@@ -152,8 +152,8 @@ def _velocity_rms(track: Trajectory, reference: Trajectory) -> float | None:
 def _end(track: Trajectory, reference: Trajectory) -> dict[str, float | bool | None]:
     """Error and covariance at the last common epoch."""
     time = _common(track, reference)[-1:]
-    estimate = track.at(time)
-    error = (estimate.p_n - reference.at(time).p_n)[:, :2]
+    estimate = track.clamped(time)
+    error = (estimate.p_n - reference.clamped(time).p_n)[:, :2]
     covariance = estimate.cov_p[:, :2, :2]
     nees = float(normalised_error(error, covariance)[0])
     return {

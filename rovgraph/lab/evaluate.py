@@ -110,7 +110,7 @@ def evaluate(
             f"({_span(trajectory)}) from {first:.1f} s {until}, at least 2 are needed; are both on the same clock?"
         )
     truth = reference.take(common)
-    estimate = trajectory.at(truth.time)
+    estimate = trajectory.clamped(truth.time)
     removed: dict[str, Any] = {}
     if align:
         estimate, removed = aligned(estimate, truth)

@@ -127,7 +127,7 @@ def marks_beside(recording: Path, track: Trajectory, origin: tuple[float, float]
     inside = [m for m in marks if m.kind != "mark" or track.time[0] <= m.time <= track.time[-1]]
     of_vehicle = [k for k, mark in enumerate(inside) if mark.kind == "mark"]
     if of_vehicle:
-        there = track.at(np.array([inside[k].time for k in of_vehicle]))
+        there = track.clamped(np.array([inside[k].time for k in of_vehicle]))
         places = there.geodetic(origin) if origin is not None else ([None] * len(of_vehicle),) * 2
         for k, p, sd, latitude, longitude in zip(of_vehicle, there.p_n, there.p_sd, *places, strict=True):
             north, east, down = p.tolist()

@@ -14,7 +14,7 @@ from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams
 from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
-from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame
+from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
 from rovgraph.model.config import Config, config_or_defaults
 
 
@@ -65,20 +65,54 @@ class Log:
         return _log([table_of_frame(frame, source)], config, source)
 
     @staticmethod
-    def from_arrays(*tables: Mapping[str, ArrayLike], config: Config | None = None, source: str = "log") -> "Log":
-        """Make a log from arrays.
+    def from_arrays(
+        *tables: Mapping[str, ArrayLike],
+        config: Config | None = None,
+        source: str = "log",
+        **arrays: ArrayLike | tuple[ArrayLike, ArrayLike],
+    ) -> "Log":
+        """Make a log from arrays, by table or by name; NaN is no measurement.
+
+        >>> import numpy as np
+        >>> t, up = np.arange(0.0, 2.0, 0.01), np.array([0.0, 0.0, -9.81])
+        >>> acc, gyr = np.tile(up, (200, 1)), np.zeros((200, 3))
+        >>> Log.from_arrays(time=t, acc=acc, gyr=gyr, dvl=(t[::20], np.zeros((10, 3))), depth=(t[::10], np.ones(20)))
+        <Log log: imu 200, dvl 10, depth 20; 0.0 to 2.0 s>
 
         Parameters
         ----------
-        tables : column -> array_like, shape (n,), including ``time``; one table for each clock or rate
+        tables : column -> array_like, shape (n,), including ``time``; one table for each clock or rate. ``acc``,
+            ``gyr``, ``mag``, ``dvl`` and ``dvl_water`` of shape (n, 3) stand for their three columns, ``ahrs`` for
+            roll, pitch and yaw, ``fix`` of shape (n, 2) for north and east
         config, source : of `from_frame`
+        arrays : the same by name: those of ``time``, and pairs (times, values) with times of their own
 
         Raises
         ------
-        InputError : arrays of different length, or as `from_frame`
+        InputError : arrays of another shape, of different length or without times, or as `from_frame`
         """
-        time = "time" if config is None else config.columns.get("time", "time")
-        return _log([table_of_arrays(tables, time, source)], config, source)
+        columns = {} if config is None else config.columns
+        time = columns.get("time", "time")
+        named = tables_of_keywords({time if n == "time" else n: a for n, a in arrays.items()}, time, source)
+        return _log([table_of_arrays([*tables, *named], time, source, columns)], config, source)
+
+    def to_frame(self) -> pd.DataFrame:
+        """The log as a data frame, one row per measurement in the order of time: the inverse of `from_frame`.
+
+        Columns and units are rovgraph's own (docs/log-format.md), times are those of the measurements: ``columns``,
+        ``units``, ``delay_s`` and ``imu.mag`` of the configuration are applied already. So read it again with a
+        configuration without them. Positions are north and east of `origin`.
+
+        Returns
+        -------
+        DataFrame, ``time`` and the columns of the log's sensors; NaN where a row has no value
+        """
+        frames = []
+        for stream in in_precedence(self.streams.values()):
+            frame = pd.DataFrame(stream.data, columns=pd.Index(stream.columns)).dropna(axis="columns", how="all")
+            frame.insert(0, "time", stream.time)
+            frames.append(frame)
+        return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
 
     @staticmethod
     def from_rows(rows: Sequence[Rows], config: Config | None = None, source: str = "log") -> "Log":
@@ -97,7 +131,8 @@ class Log:
 
     def __repr__(self) -> str:
         sensors = ", ".join(f"{name} {len(stream)}" for name, stream in self.streams.items())
-        return f"<Log {self.source}: {sensors}>"
+        span = f"; {self.start:.1f} to {self.end:.1f} s" if self.streams else ""
+        return f"<Log {self.source}: {sensors}{span}>"
 
     def __contains__(self, sensor: str) -> bool:
         return sensor in self.streams

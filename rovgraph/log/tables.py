@@ -342,13 +342,67 @@ def table_of_frame(frame: pd.DataFrame, source: str) -> Table:
     return Table(source, frame.set_axis(names, axis="columns"), np.arange(len(frame), dtype=np.int64) + 2)
 
 
-def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source: str) -> Table:
+VECTORS = {  # what is given as one array of shape (n, k) -> its columns
+    "acc": ("acc_x", "acc_y", "acc_z"),
+    "gyr": ("gyr_x", "gyr_y", "gyr_z"),
+    "mag": ("mag_x", "mag_y", "mag_z"),
+    "ahrs": ("ahrs_roll", "ahrs_pitch", "ahrs_yaw"),
+    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz"),
+    "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
+    "fix": ("fix_north", "fix_east"),
+}
+
+
+def tables_of_keywords(given: Mapping[str, Any], time: str, source: str) -> list[Mapping[str, ArrayLike]]:
+    """Tables of arrays that are given by name: those of ``time``, and pairs (times, values) with their own.
+
+    Raises
+    ------
+    InputError : arrays without times
+    """
+    own = {name: values for name, values in given.items() if not _has_times(values)}
+    tables: list[Mapping[str, ArrayLike]] = [
+        {time: times[0], name: times[1]} for name, times in given.items() if name not in own
+    ]
+    if own and time not in own:
+        name = next(iter(own))
+        raise InputError(f"{source}: {name} has no times: give {time}=..., or {name}=(times, values)")
+    return [own, *tables] if own else tables
+
+
+def _has_times(values: object) -> bool:
+    return isinstance(values, tuple) and len(values) == 2 and np.ndim(values[0]) > 0
+
+
+def _with_columns(table: Mapping[str, ArrayLike], names: Mapping[str, str], source: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a table, those of `VECTORS` by column; ``names`` are what a file calls rovgraph's."""
+    out: dict[str, NDArray[Any]] = {}
+    for name, given in table.items():
+        values = _array(name, given, source)
+        if name not in VECTORS:
+            out[name] = values
+            continue
+        columns = VECTORS[name]
+        if values.dtype.kind not in "biuf":
+            raise InputError(f"{source}: {name} holds {values.dtype}, expected numbers")
+        if values.ndim != 2 or values.shape[1] != len(columns):
+            raise InputError(
+                f"{source}: {name} has shape {values.shape}, expected (n, {len(columns)}): {', '.join(columns)}"
+            )
+        out |= {names.get(column, column): axis for column, axis in zip(columns, values.T, strict=True)}
+    return out
+
+
+def table_of_arrays(
+    tables: Sequence[Mapping[str, ArrayLike]], time: str, source: str, names: Mapping[str, str] | None = None
+) -> Table:
     """One table of some that have a time each, in the order of time.
 
     Parameters
     ----------
-    tables : column -> array_like, shape (n,)
+    tables : column -> array_like, shape (n,); those of `VECTORS` have shape (n, k)
     time : name of the column that orders them; a step back within one of them stays one
+    names : rovgraph's column -> its name in the tables, where it is another
 
     Raises
     ------
@@ -359,7 +413,7 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
         if not isinstance(table, Mapping):
             what = f"table {number} is {kind_of(table)}, expected a mapping of column names to arrays"
             raise InputError(f"{source}: {what}; a configuration is given as config=...")
-        arrays = {name: _array(name, values, source) for name, values in table.items()}
+        arrays = _with_columns(table, names or {}, source)
         for name, values in arrays.items():
             if values.ndim != 1:
                 raise InputError(f"{source}: column {name} has shape {values.shape}, expected one number per row")

@@ -301,6 +301,10 @@ class Config(ConfigSection):
             raise PydanticCustomError("stated_twice", f"delay_s and online.delay_s both name {twice[0]}; state it once")
         return data | {"online": rest, "delay_s": {**former, **delays}}
 
+    def __repr__(self) -> str:
+        stated = sorted(self.model_fields_set - {"version", "name"})
+        return f"<Config {self.name}: states {', '.join(stated) or 'nothing'}>"
+
     @property
     def table(self) -> TableSettings:
         """How tables are written that `files` does not name."""

@@ -242,7 +242,7 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]
         panels[2].plot(clock(time), within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
-        difference = np.rad2deg(wrap_angle(heading - main.trajectory.at(time).rpy[:, 2]))
+        difference = np.rad2deg(wrap_angle(heading - main.trajectory.clamped(time).rpy[:, 2]))
         panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
     names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
     for axes, name in zip(panels, names, strict=False):
@@ -285,7 +285,7 @@ def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tu
     if "mag" in log:
         some = thin(len(log["mag"]), MOST_SAMPLES)
         time = log["mag"].time[some]
-        out["mag"] = (time, _levelled(track.at(time), rotate(R_imu, log["mag"].data[some])) + declination)
+        out["mag"] = (time, _levelled(track.clamped(time), rotate(R_imu, log["mag"].data[some])) + declination)
     return out
 
 

@@ -15,7 +15,7 @@ axes, as an estimator states them, and walk from sample to sample.
 Errors that last are first-order Gauss-Markov processes (Gelb 1974, 3.8) of calibration variables.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -144,6 +144,7 @@ DVL_COLUMNS = ["dvl_vx", "dvl_vy", "dvl_vz"]
 WATER_COLUMNS = ["dvl_water_vx", "dvl_water_vy", "dvl_water_vz"]
 TIME_STEP = 1e-4  # resolution of the log's clock [s]
 PASSING_STEP = 0.02  # between epochs at which it is seen whether a place is near [s]
+COMPASS_RATE = 10.0  # of compasses that only the configuration names [Hz]
 AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
 
 
@@ -195,7 +196,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, lasting, rng)
     frames = [_inertial(sample, path, motion, bias), _pings(sample, path)]
-    makers = (_depths, _attitudes, _fixes, _signals, _sightings)
+    makers = (_depths, _attitudes, _autopilot_headings, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
     log = pd.concat(frames, ignore_index=True)
@@ -228,6 +229,11 @@ class _Sampler:
         self.truth, self.calibration, self.lasting, self.rng = truth, calibration, lasting, rng
         self.instruments = instruments(truth.config)
         self.covariances = truth.covariances if truth.noise else None
+
+    @property
+    def heading_sources(self) -> Sequence[str]:
+        """Compasses that the configuration names; the log has to have them, or it could not smooth its own dive."""
+        return self.truth.config.heading.sources or ()
 
     def motion(self, sensor: str, path: Path, stamps: Array) -> Motion:
         """The motion that a sensor measured: stamps are late by its time offset."""
@@ -354,16 +360,24 @@ def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
     """The inertial unit's own fused attitude: roll and pitch of its axes, a compass heading."""
     truth = sample.truth
-    if truth.ahrs_rate is None:
+    rate = truth.ahrs_rate or (COMPASS_RATE if "ahrs" in sample.heading_sources else None)
+    if rate is None:
         return None
-    stamps = sample.epochs(path, 1.0 / truth.ahrs_rate)
+    stamps = sample.epochs(path, 1.0 / rate)
     motion = sample.motion("ahrs", path, stamps)
-    memory = truth.ahrs_memory * truth.ahrs_rate
+    memory = truth.ahrs_memory * rate
     tilt = rpy_from_matrix(motion.R_nb @ mount_matrix(truth.config.imu.mount_rpy_deg))[:, :2]
     tilt = tilt + remembered(sample.noise(AHRS_TILT_SD, tilt.shape), memory)
     yaw = sample.exact("ahrs", motion)
     yaw = yaw + remembered(sample.noise(sample.instruments["ahrs"].sd, yaw.shape), memory)
     return _frame(stamps, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], wrap_angle(np.hstack([tilt, yaw])))
+
+
+def _autopilot_headings(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    """The autopilot's heading, where the configuration names it as a source."""
+    if "vehicle" not in sample.heading_sources:
+        return None
+    return _regular(sample, path, "vehicle_heading", 1.0 / COMPASS_RATE)
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:

@@ -14,6 +14,7 @@ from rovgraph.sensors import SENSORS, Level
 
 GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
 GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
+EXACT = 1e-9  # spread of velocities without noise [m/s]
 FAST_TURN = 3.0  # no vehicle of this kind turns faster for long [rad/s]
 FAST_SPIKE = 10.0  # nor for a moment [rad/s]
 CLIPPED = 10  # samples at one extreme, which noise does not make
@@ -103,7 +104,18 @@ def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
         text = f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
         yield Finding("imu", "warning", text, "spikes")
     if not np.ptp(log["imu"].data[:, 3:], axis=0).any():
-        yield Finding("imu", "error", "the gyro's values never change; check its connection", "stuck")
+        if _without_noise(log):
+            text = "IMU and DVL never change, as simulated without noise; if they are real, check their connection"
+            yield Finding("imu", "warning", text, "frozen")
+        else:
+            yield Finding("imu", "error", "the gyro's values never change; check its connection", "stuck")
+
+
+def _without_noise(log: Log) -> bool:
+    """Whether the signals of IMU and DVL are those of a steady motion without noise."""
+    constant = not np.ptp(log["imu"].data, axis=0).any()
+    velocity = log["dvl"].data[:, :3] if "dvl" in log else np.empty((0, 3))
+    return bool(constant and len(velocity) > 2 and velocity.any() and np.ptp(velocity, axis=0).max() < EXACT)
 
 
 def angles(log: Log, config: Config) -> Iterator[Finding]:

@@ -64,7 +64,7 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
             f"column {column}: its times, {np.nanmin(time):.1f} to {np.nanmax(time):.1f} s, are all outside the dive, "
             f"{t.time[0]:.1f} to {t.time[-1]:.1f} s; state the difference of the clocks as an offset"
         )
-    at_rows = Track(track.name, track.estimate, t.at(np.sort(time[inside])), track.origin)
+    at_rows = Track(track.name, track.estimate, t.clamped(np.sort(time[inside])), track.origin)
     order = np.argsort(np.argsort(time[inside], kind="stable"), kind="stable")
     frame = table.copy()
     for name, values in _columns(at_rows).iloc[order].items():
@@ -135,7 +135,7 @@ def geotag(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path) ->
     """
     import piexif
 
-    at = track.trajectory.at(tagged.time)
+    at = track.trajectory.clamped(tagged.time)
     lat, lon = Track(track.name, track.estimate, at, track.origin).lat_lon
     chosen = np.flatnonzero(tagged.inside).tolist()
     row_of: dict[str, int] = {}

@@ -156,7 +156,7 @@ class Track:
         wanted = np.arange(np.ceil(time[0] * rate), np.floor(time[-1] * rate) + 1.0) / rate
         if not len(wanted):
             raise InputError(f"{self.name}: is shorter than {1.0 / rate:g} s; give a higher rate")
-        return replace(self, trajectory=self.trajectory.at(wanted))
+        return replace(self, trajectory=self.trajectory.clamped(wanted))
 
 
 def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float, float]:
