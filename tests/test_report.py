@@ -544,6 +544,20 @@ def test_figures_exist_with_sane_sizes(dive, tmp_path):
         assert width == 1080 and 500 < height < 2500
 
 
+@pytest.mark.parametrize(("form", "begin"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_figures_as_vectors_are_equal_files_in_each_run(form, begin, dive, tmp_path):
+    from rovgraph.report.figures import draw_figures
+
+    estimates, log, config, _ = dive
+    drawn = []
+    for name in ("once", "again"):
+        (tmp_path / name).mkdir()
+        drawn.append(draw_figures(tmp_path / name, estimates[:1], log, config, form=form))
+    assert {path.suffix for path in drawn[0]} == {f".{form}"} and len(drawn[0]) >= 5
+    for one, other in zip(*drawn, strict=True):
+        assert one.read_bytes().startswith(begin) and one.read_bytes() == other.read_bytes()
+
+
 def test_figures_of_bare_estimates(dive, tmp_path):
     """No fixes, no compass, no uncertainty, no history, no residuals, no motion."""
     from rovgraph.report.figures import draw_figures

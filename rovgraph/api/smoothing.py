@@ -53,6 +53,9 @@ def _map(p_n: Array) -> str:
     )
 
 
+FIGURES = ("png", "pdf", "svg")  # formats
+
+
 @dataclass(frozen=True, repr=False)
 class Result:
     """The estimates of a dive with verdict and alarms.
@@ -164,7 +167,7 @@ class Result:
         self,
         path: Path | str,
         force: bool = False,
-        figures: bool = True,
+        figures: bool | str = True,
         page: bool = True,
         export: str | Sequence[str] = (),
     ) -> dict[str, Any]:
@@ -174,7 +177,7 @@ class Result:
         ----------
         path : the folder to create
         force : replace an older results folder
-        figures : draw them
+        figures : "png", "pdf" or "svg", the format to draw them in; True = "png", False = none
         page : make report.html
         export : a further format to write the track in, or several
 
@@ -184,18 +187,21 @@ class Result:
 
         Raises
         ------
-        InputError : the folder exists or cannot be written; those of `rovgraph.export`
+        InputError : the folder exists or cannot be written; an unknown format of figures; those of `rovgraph.export`
         """
         from rovgraph.live.marks import MARKS, marks_beside, write_marks
         from rovgraph.report.folder import results_folder
         from rovgraph.report.results import Remarks, write_results
 
+        form = "png" if figures is True else figures or None
+        if form not in (*FIGURES, None):
+            raise InputError(f"figures {figures!r}: expected {', '.join(FIGURES)}, True or False")
         began = time.perf_counter()
         with results_folder(as_path(path, "path"), force, [Path(self.log.source)]) as folder:
-            if figures:
+            if form:
                 from rovgraph.report.figures import draw_figures  # loads matplotlib
 
-                draw_figures(folder, self.dive.estimates, self.log, self.config)
+                draw_figures(folder, self.dive.estimates, self.log, self.config, form=form)
             if export:
                 write_track(self.track(), as_texts(export, "export"), folder, ExportOptions())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}

@@ -30,6 +30,14 @@ class Which(StrEnum):
     both = "both"
 
 
+class Figures(StrEnum):
+    """Formats of figures."""
+
+    png = "png"
+    pdf = "pdf"
+    svg = "svg"
+
+
 def smooth(
     files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
@@ -40,7 +48,8 @@ def smooth(
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
-    figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
+    figures: Annotated[Figures, typer.Option(help="format of the figures")] = Figures.png,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="draw none")] = False,
     export: Annotated[
         list[str] | None,
         typer.Option(help="also write the track as kml, geojson, ... (docs/export.md); may be repeated"),
@@ -74,7 +83,7 @@ def smooth(
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
-    summary = result.save(out, force, figures, page, export or [])
+    summary = result.save(out, force, False if no_figures else figures.value, page, export or [])
     show_result(result, summary, out, verbose)
     if strict and result.verdict != "trusted":
         raise typer.Exit(NOT_TRUSTED)

@@ -537,7 +537,12 @@ def _name_axes(axes: Axes, limits: Array, name: str, outside: int) -> None:
 
 
 def draw_figures(
-    folder: Path, estimates: Sequence[Estimate], log: Log, config: Config, reference: Trajectory | None = None
+    folder: Path,
+    estimates: Sequence[Estimate],
+    log: Log,
+    config: Config,
+    reference: Trajectory | None = None,
+    form: str = "png",
 ) -> list[Path]:
     """Draw every figure that the estimates have data for.
 
@@ -547,21 +552,22 @@ def draw_figures(
     estimates : of one log; the smoothed one leads where there is one
     log, config : what they were made from
     reference : a known trajectory to draw beside them, or None
+    form : "png", "pdf" or "svg"
 
     Returns
     -------
-    list of Path : the PNG files written
+    list of Path : the files written
     """
     estimates = main_first(estimates)
     # dead reckoning differentiates every ping: against time it would hide the others
     over_time = [e for e in estimates if e.kind != "dead_reckoning"] or estimates
     with style():
         figures = {
-            "track.png": draw_track(estimates, log, config, reference),
-            "velocity.png": draw_velocity(over_time),
-            "attitude.png": draw_attitude(over_time, log, config),
-            "depth.png": draw_depth(over_time, log),
-            "residuals.png": draw_residuals(estimates[0]),
-            "calibration.png": draw_calibration(over_time),
+            "track": draw_track(estimates, log, config, reference),
+            "velocity": draw_velocity(over_time),
+            "attitude": draw_attitude(over_time, log, config),
+            "depth": draw_depth(over_time, log),
+            "residuals": draw_residuals(estimates[0]),
+            "calibration": draw_calibration(over_time),
         }
-        return [save(figure, folder / name) for name, figure in figures.items() if figure is not None]
+        return [save(figure, folder / f"{name}.{form}") for name, figure in figures.items() if figure is not None]

@@ -55,6 +55,8 @@ _RC: dict[str, Any] = {
     "lines.solid_capstyle": "round",
     "axes.formatter.useoffset": False,
     "axes.formatter.limits": (-3, 5),
+    "pdf.fonttype": 42,  # text stays text that can be searched and edited
+    "svg.hashsalt": "rovgraph",  # the same names of parts in each run
 }
 
 
@@ -73,7 +75,14 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG, drawn once (`Figure.savefig` lays everything out twice)."""
+    """Write a figure in the format of the path's suffix, a PNG drawn once (`Figure.savefig` lays it out twice).
+
+    PDF and SVG carry no date, so equal results are equal files.
+    """
+    if path.suffix != ".png":
+        date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
+        figure.savefig(path, metadata={"Creator": "rovgraph", date: None})
+        return path
     for axes in figure.axes:
         axes.spines[:].set_in_layout(False)  # nowhere beyond the ticks, and slow to measure
     canvas: Any = FigureCanvasAgg(figure)
