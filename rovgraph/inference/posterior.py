@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
 from rovgraph.geometry import Array, cross, exp_rotation, log_rotation, rotate, skew
@@ -204,8 +205,8 @@ class Posterior:
                 rows = (own[:, None] * MOTION + np.arange(MOTION)).ravel()
                 noise[np.ix_(rows, rows)] = Q
                 states.append(state)
-        L = L.reshape(q * MOTION, -1)
-        P = L @ marginals.joint(keyframes) @ L.T + noise
+        by_known = L.reshape(q * MOTION, -1)
+        P = by_known @ marginals.joint(keyframes) @ by_known.T + noise
         R_nb, bias = (np.concatenate([getattr(s, name) for s in states]) for name in ("R_nb", "bias"))
         P = self._at_origin(P, times, R_nb, bias)
         P = self._displaced(P, times, R_nb)
@@ -248,13 +249,13 @@ class Posterior:
     def _believed(self) -> Array:
         return self.optimum.believed
 
-    def _places(self, times: Array) -> tuple[Index, Array]:
+    def _places(self, times: Array) -> tuple[Index, NDArray[np.bool_]]:
         """Keyframe at each time or before it, and whether the time lies between keyframes."""
         known = self.time
         nearest = np.clip(np.searchsorted(known, times - HERE_S), 0, len(known) - 1)
         here = np.abs(known[nearest] - times) <= HERE_S
         before = np.where(here, nearest, np.searchsorted(known, times, side="right") - 1)
-        return before, ~here
+        return before.astype(np.int64), np.logical_not(here)
 
     def _state(self, k: int, times: Array) -> State:
         """States at times from keyframe k to the next, interpolated."""
@@ -289,10 +290,10 @@ class Posterior:
             preintegrate(imu, at[a], at[a + 1], none, motions[a], S[a], stops)
         motion_weights(motions, S, W)
         r, A_i, A_j = np.empty((q + 1, MOTION)), *np.empty((2, q + 1, MOTION, MOTION))
-        before, after = (
-            States(*(np.ascontiguousarray(a[part]) for a in stack), np.empty((1, 0)))
-            for part in (slice(None, -1), slice(1, None))
-        )
+        R_nb, p_n, v_n, bias = (np.ascontiguousarray(a) for a in stack)
+        none_estimated = np.empty((1, 0))
+        before = States(R_nb[:-1], p_n[:-1], v_n[:-1], bias[:-1], none_estimated)
+        after = States(R_nb[1:], p_n[1:], v_n[1:], bias[1:], none_estimated)
         motion_errors(motions, before, after, r, A_i, A_j)
         rows = np.zeros((q + 1, MOTION, q + 2, MOTION))
         for a in range(q + 1):
@@ -308,7 +309,7 @@ class Posterior:
             ],
             axis=2,
         )
-        R = np.linalg.qr(J.reshape(-1, J.shape[2]), mode="r")[:size]
+        R: Array = np.asarray(np.linalg.qr(J.reshape(-1, J.shape[2]), mode="r"))[:size]
         root = np.asarray(np.linalg.inv(R[:, :size]))
         gain = (-root @ R[:, size:-1]).reshape(q, MOTION, -1)
         known = [n for n in SCALES if n in self.optimum.wide.layout.places]
