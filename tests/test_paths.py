@@ -201,7 +201,7 @@ def refuse_unless_printed(quoted: str, printed: str) -> None:
 
 def alike(line: str) -> tuple[list[str], list[float]]:
     """The words of a line with a 0 for each number, and the numbers."""
-    number = r"(?<![\w.])[+-]?\d+(?:\.\d+)?"
+    number = r"(?<![\w.])[+-]?\d+(?:\.\d+)?(?:e[+-]\d+)?"
     return re.sub(number, "0", line).split(), [float(found) for found in re.findall(number, line)]
 
 
