@@ -82,8 +82,8 @@ def seconds_of_moments(given: Moments, clock: Array, name: str) -> Array:
         raise InputError(
             f"{name} {_shown(given)}: is a date, but the track's clock is not Unix time (it begins at {begin})"
         )
-    seconds = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float)
-    return np.reshape(seconds, values.shape)
+    seconds = np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
+    return np.asarray(seconds.reshape(values.shape))
 
 
 def _shown(given: object) -> str:
