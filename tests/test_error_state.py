@@ -41,9 +41,9 @@ from rovgraph.kernels.correction import (
     Innovations,
     Weights,
     admit,
-    directions_seen,
     innovation_covariance,
     joseph,
+    observed_directions,
     reweight,
 )
 from rovgraph.kernels.error_coordinates import ErrorColumns as Coordinates
@@ -318,7 +318,7 @@ def test_a_knock_at_any_time_since_has_the_moments_of_a_uniform_time():
     x[:9] = matrix_from_rpy(np.array([0.3, -0.2, 1.0])).ravel()
     sensor[measurement_row.SEES : measurement_row.SEES + 3] = 1.0
     sensor[measurement_row.SEEN_FRAME] = measurement_row.SEES_VELOCITY
-    seen, spread = directions_seen(x, sensor, MOTION, T)
+    seen, spread = observed_directions(x, sensor, MOTION, T)
     R_nb, second = x[:9].reshape(3, 3), seen @ seen.T + spread @ spread.T
     np.testing.assert_allclose(second[6:9, 6:9], np.eye(3))
     np.testing.assert_allclose(second[6:9, 3:6], 0.5 * T * R_nb, atol=1e-12)

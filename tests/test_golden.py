@@ -69,7 +69,7 @@ def no_imu() -> Case:
     heading, dvl = {"sources": ["vehicle"], "vehicle_sd_deg": 1.0}, {"velocity_sd_mps": [0.02, 0.02, 0.02]}
     config = falcon(heading=heading, dvl=dvl, tilt={"sd_deg": 0.5}, motion={"acc": 0.05, "rate_sd_dps": 3.0})
     case = falcon_dive(60.0, 4, config, imu_rate=50.0)
-    log = without(case.log, "imu", "mag", "ahrs", "dvl_heading")
+    log = without(case.log, "imu", "mag", "ahrs", "dvl_heading", "vehicle_heading")
     return with_attitude(log, case, np.random.default_rng(4)), config
 
 
@@ -79,7 +79,7 @@ def boat() -> Case:
     config = falcon(heading=heading, dvl=dvl, tilt={"sd_deg": 0.5}, fix={"sd_m": 1.0})
     rates = {**SLOW_RATES, "imu_rate": 50.0, "fix_interval": 1.0}
     case = simulated(config, 60.0, 5, "lawnmower", LIVELY, **rates)
-    log = without(case.log, "imu", "mag", "ahrs", "dvl_heading", "depth")
+    log = without(case.log, "imu", "mag", "ahrs", "dvl_heading", "vehicle_heading", "depth")
     return with_attitude(log, case, np.random.default_rng(5)), config
 
 

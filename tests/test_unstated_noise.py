@@ -11,7 +11,7 @@ from rovgraph.diagnosis import find_alarms
 from rovgraph.diagnosis.unstated_noise import find_errors, find_noise, noise_factor, unstated
 from rovgraph.dive import smooth
 from rovgraph.inference.chain import Chain
-from rovgraph.inference.correlated_noise import LASTING, LinearConstants, _Baseline, find_correlated_noise, unity
+from rovgraph.inference.correlated_noise import LASTING, LinearConstants, _Baseline, find_correlated_noise, window_chi2
 from rovgraph.model.calibration import TABLE
 from rovgraph.model.config import beliefs, parse_config
 from rovgraph.model.gauss_markov import stationary_walk
@@ -196,9 +196,9 @@ def test_times_in_which_everything_was_rejected_do_not_count_as_agreement():
     H = np.ones((400, 1, 1))
     part = SimpleNamespace(time=time[:120], normalised=lambda _: r[:120])
     whole = SimpleNamespace(time=time, normalised=lambda _: r)
-    alone = unity(part, None, H[:120], np.full(120, True))
-    assert unity(whole, None, H, time < 120.0) == pytest.approx(alone)
-    assert unity(whole, None, H, np.full(400, False)) == 1.0
+    alone = window_chi2(part, None, H[:120], np.full(120, True))
+    assert window_chi2(whole, None, H, time < 120.0) == pytest.approx(alone)
+    assert window_chi2(whole, None, H, np.full(400, False)) == 1.0
 
 
 def test_gains_of_constants_by_one_elimination_are_those_of_each_by_itself(correlated):

@@ -120,7 +120,7 @@ WORTH_A_LOOK = {
     "vehicle_heading": 0.5,
     "fix": 1.0,
     "depth": 0.4,  # healthy ones have at most 0.2, those with 3 cm of error that lasts 0.7
-}  # least `unity`; the track takes a DVL's error along
+}  # least `window_chi2`; the track takes a DVL's error along
 CLEAR = 8.0  # gain beyond chance: of healthy dives one in a hundred reaches 6
 PART_OF_BEST = 0.25  # of the best explanation's gain, that a rival has: wrong ones had 0.46 of the right one's and more
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
@@ -407,7 +407,9 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[GaussMarkovError]:
         state = solution.point.at(block.keyframe)
         H = block.by_calibration(state, name)
         seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
-        if not np.any(seen > 0.0) or unity(block, state, H, solution.gates[sensor]) < WORTH_A_LOOK.get(sensor, 0.0):
+        if not np.any(seen > 0.0) or window_chi2(block, state, H, solution.gates[sensor]) < WORTH_A_LOOK.get(
+            sensor, 0.0
+        ):
             continue
         sd = min(float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), 0.5 * _largest(chain, name))
         time_constant = float(np.clip(TABLE[name].time_constant, *_time_constants(chain, sensor)))
@@ -417,7 +419,7 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[GaussMarkovError]:
     return out
 
 
-def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
+def window_chi2(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
     """Correlation of a sensor's residuals over seconds: variance of sums over a time, 1 for independent noise.
 
     Parameters

@@ -147,7 +147,7 @@ class Elimination(NamedTuple):
     left: Vector
 
 
-class Room(NamedTuple):
+class Buffers(NamedTuple):
     """Where rows are worked on.
 
     Attributes
@@ -168,7 +168,7 @@ class Room(NamedTuple):
 
 
 @helper
-def make_room(d: int, c: int, most: int, border_rows: Array) -> Room:
+def make_room(d: int, c: int, most: int, border_rows: Array) -> Buffers:
     """Room for keyframes of d components, each with at most so many rows of measurements; the border's priors in it."""
     V, W = np.zeros((d + most, padded(d + c + 1))), np.zeros((2 * d, padded(2 * d + c + 1)))
     Y = np.zeros((c + border_rows.shape[0] + PENDING + most, padded(c + 1)))
@@ -177,7 +177,7 @@ def make_room(d: int, c: int, most: int, border_rows: Array) -> Room:
         for j in range(c):
             scale[d + j] += border_rows[i, j] * border_rows[i, j]
     append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
-    return Room(V, W, Y, scale, np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1]))
+    return Buffers(V, W, Y, scale, np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1]))
 
 
 @view_helper
@@ -201,7 +201,7 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
 
 
 @view_helper
-def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Room) -> int:
+def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Buffers) -> int:
     """Rows of a keyframe's measurements into V, below the d rows that are known of it; returns the row after them."""
     rows, targets, begin = measured.rows, measured.targets, measured.first[k]
     count: int = measured.first[k + 1] - begin
@@ -222,7 +222,7 @@ def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Room) 
 
 
 @view_helper
-def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, walk_r: Array, room: Room) -> int:
+def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, walk_r: Array, room: Buffers) -> int:
     """Rows of the motion after a keyframe into W, below its own d; the scale becomes that of the keyframe after it.
 
     A has shape (s, 2 (s + 1)): columns of the keyframe before, right-hand side, columns of the keyframe after. The rest
@@ -295,7 +295,9 @@ def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int
 
 
 @view_helper
-def absorb(k: int, n: int, end: int, last: int, stop: int, room: Room, out: Elimination) -> tuple[int, int, int]:
+def triangularise_keyframe(
+    k: int, n: int, end: int, last: int, stop: int, room: Buffers, out: Elimination
+) -> tuple[int, int, int]:
     """Make a triangle of keyframe k's rows in V, up to ``end``, and put it where its motion is added.
 
     Parameters
@@ -330,7 +332,7 @@ def absorb(k: int, n: int, end: int, last: int, stop: int, room: Room, out: Elim
 
 
 @view_helper
-def pass_on(k: int, n: int, dense: int, room: Room, conditionals_out: Array) -> int:
+def eliminate_keyframe(k: int, n: int, dense: int, room: Buffers, conditionals_out: Array) -> int:
     """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1.
 
     ``dense`` is what `load_motion` returned. Of the conditional only R's diagonal is kept where there is room for one
@@ -354,7 +356,7 @@ def pass_on(k: int, n: int, dense: int, room: Room, conditionals_out: Array) -> 
 
 
 @view_helper
-def close_border(n: int, d: int, room: Room, border_out: Array) -> int:
+def close_border(n: int, d: int, room: Buffers, border_out: Array) -> int:
     """The border's triangle, when all keyframes are eliminated; returns what is not determined, or -1."""
     c = room.scale.shape[0] - d
     append_rows(room.Y, 0, c, 0, c + 1, 0, border_out)

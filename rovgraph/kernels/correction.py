@@ -42,12 +42,12 @@ from rovgraph.kernels.filter_state import FilterModel, FilterState, retract_with
 from rovgraph.kernels.layout import TRANSLATION, VELOCITY
 from rovgraph.kernels.linearization import LinearizationScratch, linearize_measurement, make_scratch, pick
 from rovgraph.kernels.measurement_row import (
-    BEND,
     DIM,
     GATE,
-    GIVEN,
     KIND,
     LOSS,
+    LOSS_THRESHOLD,
+    PRELINEARISED,
     READMIT,
     SEEN_FRAME,
     SEES,
@@ -64,7 +64,7 @@ RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovatio
 
 
 @helper
-def directions_seen(x: Array, sensor: Array, n: int, elapsed: float) -> tuple[Array, Array]:
+def observed_directions(x: Array, sensor: Array, n: int, elapsed: float) -> tuple[Array, Array]:
     """Directions of the error in which something unknown has moved a state by one in what a sensor sees.
 
     Parameters
@@ -456,7 +456,7 @@ def split(row: Array, L: Array, H_out: Array, H_y_out: Array) -> None:
 def linearize_keyframe(
     known: FilterState, measured: MeasuredRows, model: FilterModel, scratch: LinearizationScratch, found: Innovations
 ) -> None:
-    """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`.
+    """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `PRELINEARISED`.
 
     Columns of what is considered, behind those of what is estimated, are multiplied by L.
     """
@@ -467,7 +467,7 @@ def linearize_keyframe(
     state = epoch_in(known.x, known.c)
     for j in range(len(which)):
         begin, end = first[j], first[j + 1]
-        if sensors[which[j], KIND] != GIVEN:
+        if sensors[which[j], KIND] != PRELINEARISED:
             one = pick(measured, j, sensors, scratch)
             linearize_measurement(state, one, model.gravity, scratch, r_out[begin:end], wide[begin:end])
             if len(L):
@@ -543,7 +543,7 @@ def relinearize(
 
 
 class GivenRows(NamedTuple):
-    """Whitened rows of k measurements of kind `GIVEN`, shapes (k,), (k, n); what is considered comes last."""
+    """Whitened rows of k measurements of kind `PRELINEARISED`, shapes (k,), (k, n); what is considered comes last."""
 
     r: Array
     H: Array
@@ -597,8 +597,8 @@ def correct(
     loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(known.c), model.column)
     for j in range(m):
         sensor = sensors[which[j]]
-        loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
-        if sensor[KIND] == GIVEN:
+        loss[j], bend[j] = int(sensor[LOSS]), sensor[LOSS_THRESHOLD]
+        if sensor[KIND] == PRELINEARISED:
             for a in range(first[j], first[j + 1]):
                 r[a] = given.r[taken]
                 split(given.H[taken], L, H[a, : given.H.shape[1] - len(L)], H_y[a])
@@ -614,7 +614,7 @@ def correct(
             weight_out[j] = 0.0
             elapsed = rows[j, TIME] - since[which[j]]
             if elapsed > sensor[READMIT]:
-                directions, spread = directions_seen(x, sensor, n, elapsed)
+                directions, spread = observed_directions(x, sensor, n, elapsed)
                 inflate(P, found, j, directions, spread)
                 innovation_covariance(P, found)
             leave_out(found, j)

@@ -13,16 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rovgraph.kernels.chain import (
+    Buffers,
     Elimination,
     PlacedRows,
-    Room,
     Walks,
-    absorb,
     close_border,
+    eliminate_keyframe,
     load_measurements,
     load_motion,
     make_room,
-    pass_on,
+    triangularise_keyframe,
 )
 from rovgraph.kernels.compile import Flags, Index, Matrices, Matrix, Vector, kernel, view_helper
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
@@ -33,7 +33,7 @@ from rovgraph.kernels.linearization import (
     pick,
     squared_length,
 )
-from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST, MeasuredRows
+from rovgraph.kernels.measurement_row import DIM, KIND, LOSS, LOSS_THRESHOLD, MOST, PRELINEARISED, MeasuredRows
 from rovgraph.kernels.motion_residual import make_residual_scratch, motion_error, whiten_motion
 from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
 from rovgraph.kernels.states import States, epoch, with_bias
@@ -49,7 +49,7 @@ class DiveFactors(NamedTuple):
     scales : shape (n - 1, 6, 6), bias by the IMU's scales in each interval, or (0, 6, 6) where these are exact
     measured : m measurements in the order of keyframes
     first : shape (n + 1,), a keyframe's first measurement
-    sensors : a row for each sensor, of `rovgraph.kernels.measurement_row`; those that are `GIVEN` are left out
+    sensors : a row for each sensor, of `rovgraph.kernels.measurement_row`; those that are `PRELINEARISED` are left out
     gravity : [m/s^2]
     """
 
@@ -69,7 +69,7 @@ def load_linearized(
     point: States,
     dive: DiveFactors,
     entered: Flags,
-    room: Room,
+    room: Buffers,
     scratch: LinearizationScratch,
     r: Vector,
 ) -> int:
@@ -78,7 +78,7 @@ def load_linearized(
     V, sums, last = room.V, room.scale, len(room.scale)
     for m in range(dive.first[k], dive.first[k + 1]):
         sensor = sensors[which[m]]
-        if not entered[m] or sensor[KIND] == GIVEN:
+        if not entered[m] or sensor[KIND] == PRELINEARISED:
             continue
         dim = int(sensor[DIM])
         for a in range(dim):
@@ -87,7 +87,7 @@ def load_linearized(
                 V[row + a, j] = 0.0
         one = pick(dive.measured, m, sensors, scratch)
         square = linearize_measurement(state, one, dive.gravity, scratch, r, V[row : row + dim])
-        root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
+        root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[LOSS_THRESHOLD]))
         for a in range(dim):
             for j in range(last):
                 V[row + a, j] *= root
@@ -134,7 +134,7 @@ def eliminate_dive(
     for k in range(n):
         end = load_measurements(k, given, MOTION, d, room)
         end = load_linearized(k, end, point, dive, entered, room, scratch, r)
-        last, stop, failing = absorb(k, n, end, last, stop, room, out)
+        last, stop, failing = triangularise_keyframe(k, n, end, last, stop, room, out)
         if k < n - 1:
             for i in range(6):
                 shift = 0.0
@@ -151,7 +151,7 @@ def eliminate_dive(
                     for m in range(6):  # of both biases alike, which leaves the walk of the bias out of it
                         C[i, j] += (A[i, 9 + m] + A[i, AFTER + 9 + m]) * scales[k, m, j]
             dense = load_motion(A, C, targets, walks.weight[k], walks.kept[k], walks.r[k], room)
-        failing = max(failing, pass_on(k, n, dense, room, out.conditionals))
+        failing = max(failing, eliminate_keyframe(k, n, dense, room, out.conditionals))
         if failing >= 0:
             return failing
     return close_border(n, d, room, out.border)
@@ -159,14 +159,14 @@ def eliminate_dive(
 
 @kernel()
 def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> None:
-    """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 of those that are `GIVEN`."""
+    """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 where `PRELINEARISED`."""
     first, sensors, which = dive.first, dive.sensors, dive.measured.which
     scratch = make_scratch(point.c.shape[1], np.empty(0, np.int64))
     for k in range(len(first) - 1):
         state = epoch(point, k)
         for m in range(first[k], first[k + 1]):
             square_out[m] = 0.0
-            if sensors[which[m], KIND] != GIVEN:
+            if sensors[which[m], KIND] != PRELINEARISED:
                 square_out[m] = squared_length(state, pick(dive.measured, m, sensors, scratch), dive.gravity, scratch)
 
 
@@ -177,7 +177,7 @@ def robust_costs(square: Vector, which: Index, sensors: Matrix, entered: Flags) 
     for m in range(len(square)):
         if entered[m]:
             sensor = sensors[which[m]]
-            total += robust_cost(square[m], int(sensor[LOSS]), sensor[BEND])
+            total += robust_cost(square[m], int(sensor[LOSS]), sensor[LOSS_THRESHOLD])
     return total
 
 
@@ -218,10 +218,10 @@ def eliminate(motions: LinearMotions, walks: Walks, measured: PlacedRows, border
     out.left[0], dense = 0.0, 0
     for k in range(n):
         end = load_measurements(k, measured, s, d, room)
-        last, stop, failing = absorb(k, n, end, last, stop, room, out)
+        last, stop, failing = triangularise_keyframe(k, n, end, last, stop, room, out)
         if k < n - 1:
             dense = load_motion(A[k], C[k], motions.targets, walks.weight[k], walks.kept[k], walks.r[k], room)
-        failing = max(failing, pass_on(k, n, dense, room, out.conditionals))
+        failing = max(failing, eliminate_keyframe(k, n, dense, room, out.conditionals))
         if failing >= 0:
             return failing
     return close_border(n, d, room, out.border)

@@ -1,8 +1,8 @@
 """The filter over one interval, and over many in a row: correct, predict, correct.
 
 `filter_intervals` does the work of `rovgraph.inference.filter.FilterEngine.step`, as far as kernels can: it stops
-before an interval with a measurement that is `GIVEN`, and where the attitude is so poorly known that it must be found
-before the measurements are linearised there (`rovgraph.inference.filter`).
+before an interval with a measurement that is `PRELINEARISED`, and where the attitude is so poorly known that it must
+be found before the measurements are linearised there (`rovgraph.inference.filter`).
 
 The prediction over one interval is
 
@@ -26,7 +26,7 @@ from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matr
 from rovgraph.kernels.correction import Corrected, GivenRows, correct
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import ACC_SCALE, MOTION, VELOCITY
-from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasuredRows, some_of
+from rovgraph.kernels.measurement_row import KIND, PRELINEARISED, MeasuredRows, some_of
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
 from rovgraph.kernels.states import Epoch, epoch_in, with_bias
@@ -164,7 +164,7 @@ def knows_all(which: Index, sensors: Array) -> bool:
     """Whether kernels have the equations of all measurements."""
     given = 0
     for j in range(len(which)):
-        given += sensors[which[j], KIND] == GIVEN
+        given += sensors[which[j], KIND] == PRELINEARISED
     return given == 0
 
 

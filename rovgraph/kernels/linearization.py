@@ -42,7 +42,6 @@ from rovgraph.kernels.layout import ACC_BIAS, ACC_SCALE, GYR_BIAS, MOTION, TRANS
 from rovgraph.kernels.layout import VELOCITY as VELOCITY_AT
 from rovgraph.kernels.measurement_row import (
     ASSUMED,
-    BEND,
     DIM,
     DP,
     DR,
@@ -56,6 +55,7 @@ from rovgraph.kernels.measurement_row import (
     KNOT_RATE,
     KNOT_S,
     LOSS,
+    LOSS_THRESHOLD,
     MOST,
     OFFSET,
     PARAMS,
@@ -419,7 +419,7 @@ def linearize(
     r_out: Vector,
     H_out: Matrix,
 ) -> None:
-    """Whitened innovations and Jacobians of m measurements, one after the other, none of them `GIVEN`.
+    """Whitened innovations and Jacobians of m measurements, one after the other, none of them `PRELINEARISED`.
 
     Parameters
     ----------
@@ -443,7 +443,7 @@ def linearize(
                     r[a] += scratch.W[a, k] * scratch.z[k]
                 square += r[a] * r[a]
         if weighted:
-            root = math.sqrt(loss_weight(square, int(one.sensor[LOSS]), one.sensor[BEND]))
+            root = math.sqrt(loss_weight(square, int(one.sensor[LOSS]), one.sensor[LOSS_THRESHOLD]))
             for a in range(begin, begin + dim):
                 r_out[a] *= root
                 for i in range(H_out.shape[1]):

@@ -14,9 +14,9 @@ measurement
 =============  =====  ==========================================================================================
 sensor
 =============  =====  ==========================================================================================
-`KIND`             1  of `rovgraph.kernels.measurements`, or `GIVEN`: linearised outside the kernels
+`KIND`             1  of `rovgraph.kernels.measurements`, or `PRELINEARISED`: linearised outside the kernels
 `DIM`              1  components
-`LOSS`, `BEND`  1, 1  of `rovgraph.kernels.weighting`, and where it begins
+`LOSS`, `LOSS_THRESHOLD`  1, 1  of `rovgraph.kernels.weighting`, and where it begins
 `GATE`             1  normalised innovation beyond which a measurement is left out, or infinite
 `READMIT`          1  time of being left out after which the filter inflates what the sensor sees [s]
 `SEES`             3  1 where an error of the `SEEN_FRAME` shows in it
@@ -37,11 +37,23 @@ SD = Z + MOST
 ROW = SD + MOST
 DT, DR, DV, DP = SNAPSHOT, SNAPSHOT + 1, SNAPSHOT + 10, SNAPSHOT + 13
 
-KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, OFFSET, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19, 20
+KIND, DIM, LOSS, LOSS_THRESHOLD, GATE, READMIT, SEES, SEEN_FRAME, GAIN, OFFSET, PARAMS = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    9,
+    10,
+    19,
+    20,
+)
 # a knot of a window: a snapshot from the keyframe, the rate [rad/s], how long before the stamp, nan behind the last [s]
 KNOT_DT, KNOT_RATE, KNOT_LAG, KNOT = 0, 16, 19, 20
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
-GIVEN = -1.0
+PRELINEARISED = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
 
 

@@ -54,9 +54,9 @@ def sensor_table(instruments: Mapping[str, Instrument], given: Sequence[str]) ->
     out = np.zeros((len(instruments), at.PARAMS + max((len(p) for p in packed.values()), default=0)))
     for row, (sensor, instrument) in zip(out, instruments.items(), strict=True):
         model, dim, offset = instrument.model, instrument.model.dim, instrument.time_offset
-        row[at.KIND] = at.GIVEN if sensor in given else model.kind  # type: ignore[attr-defined]
+        row[at.KIND] = at.PRELINEARISED if sensor in given else model.kind  # type: ignore[attr-defined]
         row[at.DIM] = dim
-        row[at.LOSS], row[at.BEND] = LOSSES.index(instrument.loss), loss_threshold(instrument.loss, dim)
+        row[at.LOSS], row[at.LOSS_THRESHOLD] = LOSSES.index(instrument.loss), loss_threshold(instrument.loss, dim)
         row[at.GATE] = np.inf if instrument.gate_sd is None else instrument.gate_sd
         row[at.READMIT] = instrument.readmit_s
         observed = SENSORS[sensor].observes

@@ -16,6 +16,7 @@ Errors that last are first-order Gauss-Markov processes (Gelb 1974, 3.8) of cali
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -374,10 +375,12 @@ def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 
 
 def _autopilot_headings(sample: _Sampler, path: Path) -> pd.DataFrame | None:
-    """The autopilot's heading, where the configuration names it as a source."""
+    """The autopilot's heading, where the configuration names it as a source; it changes no draw of other sensors."""
     if "vehicle" not in sample.heading_sources:
         return None
-    return _regular(sample, path, "vehicle_heading", 1.0 / COMPASS_RATE)
+    apart = copy(sample)
+    (apart.rng,) = sample.rng.spawn(1)
+    return _regular(apart, path, "vehicle_heading", 1.0 / COMPASS_RATE)
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
