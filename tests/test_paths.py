@@ -273,7 +273,7 @@ def test_every_command_of_a_path_is_run_or_needs_an_instrument():
         page = DOCS / f"{name}.md"
         assert [step.text for step in steps(page.read_text("utf-8")) if step.kind == "command"] == [*commands(page)]
     left = [text for name in PATHS for text in commands(DOCS / f"{name}.md") if needs_an_instrument(text)]
-    assert [re.search(r"--http|--output", text)[0] for text in left] == ["--http", "--output"]
+    assert ["--http" in text for text in left] == [True]
 
 
 def test_the_start_page_names_each_path():
