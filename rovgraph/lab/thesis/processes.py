@@ -110,7 +110,7 @@ def _fused(log: Log, config: Config, beliefs: dict[str, Belief], level: Array) -
     if np.isfinite(tilt).all():
         R_nb = matrix_from_rpy(np.column_stack([tilt, yaw])) @ R_bs.T
         nowhere = np.zeros((len(ahrs), 3))
-        return Trajectory.certain(ahrs.time, nowhere, R_nb, nowhere).at(imu.time).R_nb
+        return Trajectory.certain(ahrs.time, nowhere, R_nb, nowhere).clamped(imu.time).R_nb
     at = np.interp(imu.time, ahrs.time, np.unwrap(yaw))
     return matrix_from_rpy(np.column_stack([level, at]))
 
