@@ -16,6 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+import rovgraph as rg
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy
 from rovgraph.inference.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
@@ -461,6 +462,13 @@ def test_the_assumptions_that_could_move_the_track_come_first_and_are_three():
     assert first == [lines[4], lines[3], lines[2]]
     assert others == [lines[0], lines[1]]
     assert leading([]) == ([], [])
+
+
+def test_the_words_by_which_assumptions_are_ranked_are_those_that_estimates_write():
+    from rovgraph.report.assumptions import MATTERING
+
+    source = "".join(path.read_text(encoding="utf-8") for path in Path(rg.__file__).parent.glob("inference/*.py"))
+    assert [words for words in MATTERING if words not in source] == []
 
 
 @pytest.mark.parametrize(
