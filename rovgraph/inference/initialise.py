@@ -10,7 +10,7 @@ so one function serves all sources. `with_motion_model` decides whether a dive i
 it then begins.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
 from typing import NamedTuple
@@ -33,9 +33,10 @@ from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_
 from rovgraph.kernels.assembly import NOISIER
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import CLEAR_SPEED
-from rovgraph.model.calibration import AUTO, CONSIDERED, TABLE, Belief
+from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.state import POSE, Jacobians, State
+from rovgraph.problem.acoustics import rough_positions, unusable_acoustics
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
@@ -274,14 +275,14 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
     start, begin = config.start, log["imu"].time[0]
     p_n = np.array([start.north_m or 0.0, start.east_m or 0.0, start.down_m or 0.0])
     sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
-    if "fix" in log and not start.located:
-        fixes = log["fix"]
+    fixes, arm, what = _positions(log, config)
+    if fixes is not None and not start.located:
         if len(fixes):
             fixes = _opening(fixes, fixes.time[0], WITHIN_S)  # however late they begin: the frame is theirs
             here, own_sd = _first_fix(fixes, config.fix.sd_m)
-            p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
+            p_n[:2] = here - rotate(R_nb, np.asarray(arm))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
-            assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
+            assumptions.append(f"start position from the first {what}, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
     elif log.origin is not None and not start.located:
         where = f"latitude {log.origin[0]:.6f}, longitude {log.origin[1]:.6f}"
         assumptions.append(f"start at the origin, {where}, within {sd[0]:g} m, as the log has no fix")
@@ -294,6 +295,16 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
         assumptions.append(f"start.down_m 0.0 within {sd[2]:g} m, as the log has no depth")
     return p_n, sd
+
+
+def _positions(log: Log, config: Config) -> tuple[Stream | None, Sequence[float], str]:
+    """What the log has of positions, the arm of what is positioned, and what it is."""
+    if "fix" in log:
+        return log["fix"], config.fix.lever_arm_m, "fix"
+    acoustic = None
+    if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors):
+        acoustic = rough_positions(log, config, instruments(config))
+    return acoustic, config.usbl.beacon_arm_m, "acoustic position"
 
 
 def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
@@ -452,10 +463,13 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     """
     assumptions: list[str] = []
     log, config = with_motion_model(log, config, assumptions)
-    if "dvl" not in log and "fix" not in log:
+    unusable = unusable_acoustics(config, log.sensors | set(expected))
+    if not log.sensors - unusable.keys() & {"dvl", "fix", *ACOUSTICS}:
         raise InputError(
             f"{log.source}: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes, one of them is needed"
+            + "".join(f"; {sensor} is left out: {why}" for sensor, why in unusable.items())
         )
+    assumptions += [f"{sensor} is left out: {why}" for sensor, why in unusable.items() if sensor in log]
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | set(expected)
@@ -463,7 +477,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)
     elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
-    without_heading = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
+    without_heading = [s for s in sensors if s in present - elsewhere - unusable.keys() and SENSORS[s].heading_source is None]
     used = without_heading + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))

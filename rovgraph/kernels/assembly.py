@@ -20,7 +20,7 @@ event
 `SENSOR`, `LINE`    1, 1  its sensor, and in the log
 `NAME`                 1  of a place
 `FATE`                 1  0, or why it is left out
-`VALUES`               *  D components and their D sds, D as many as any sensor has, 3 at least
+`VALUES`               *  D components and their D sds, D as many as any sensor has, 3 at least; and the context
 ==================  ====  ==========================================================================================
 
 ==================  ====  ==========================================================================================
@@ -93,6 +93,7 @@ class KeyframeRule(NamedTuple):
     every_s : time after which a place counts again [s]
     without_imu, learns, scaled : 1 = no IMU; noise is learnt; the IMU's scale may be wrong
     rate_sd : of the rate without an IMU [rad/s]
+    context : numbers of a measurement's context, where a sensor has one
     """
 
     around: float
@@ -105,6 +106,7 @@ class KeyframeRule(NamedTuple):
     learns: float
     scaled: float
     rate_sd: float
+    context: float
 
 
 class Streams(NamedTuple):
@@ -113,7 +115,7 @@ class Streams(NamedTuple):
     Attributes
     ----------
     imu : shape (m, 7), time, specific force, rate in body axes
-    events : shape (e, VALUES + 2 D), in the order in which they came
+    events : shape (e, VALUES + 2 D + context), in the order in which they came
     order : shape (e,), events in the order of where they are put
     sensors : shape (s, ABOUT)
     steps : shape (PERIODS + 1,), longest regular sample interval, by so many periods [s]
@@ -150,7 +152,7 @@ class DiveArrays(NamedTuple):
     motions, covariances, weights : shapes (n, ROW), (n, 15, 15), (n, 15, 15), of the interval that ends with each
         keyframe but the first
     scales : shape (n, 6, 6), of it, too, or (0, 6, 6)
-    rows, row_scales : shapes (m, Z + 2 D), (m, 6, 6) or (0, 6, 6)
+    rows, row_scales : shapes (m, Z + 2 D + context), (m, 6, 6) or (0, 6, 6)
     of : shape (OF, m), sensor, keyframe, interval, line, window or -1, number of a sighting or -1
     windows : shape (w, K, KNOT)
     names : shape (m,), of places
@@ -587,7 +589,8 @@ def _take(
             return IN_VIEW
         number = int(keyframe[SIGHTED]) + 1
         keyframe[SIGHTED] = number
-    row, most = dive.rows[m], (len(event) - VALUES) // 2
+    context = int(rule.context)
+    row, most = dive.rows[m], (len(event) - VALUES - context) // 2
     for i in range(len(row)):
         row[i] = 0.0
     row[AT] = event[PLACED]
@@ -599,6 +602,8 @@ def _take(
         if sensor[SIGHTS] == 0:
             row[Z + i] = event[VALUES + i]
         row[Z + max(dim, MOST) + i] = event[VALUES + most + i]
+    for i in range(context):
+        row[Z + 2 * most + i] = event[VALUES + 2 * most + i]
     if here:
         for i in range(3):
             row[RATE + i] = keyframe[RATE_B + i]

@@ -61,12 +61,13 @@ from rovgraph.kernels.measurement_row import (
     PARAMS,
     RATE,
     RATE_SD,
+    ROW,
     SD,
     MeasuredRows,
     Z,
 )
 from rovgraph.kernels.measurements import WORK as PREDICT_WORK
-from rovgraph.kernels.measurements import is_angular, predict, wrap
+from rovgraph.kernels.measurements import ACOUSTIC, is_angular, predict, wrap
 from rovgraph.kernels.rotations import (
     cross,
     exp_rotation,
@@ -343,7 +344,9 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
             H[a, j] = 0.0
         for j in scratch.used:
             H[a, j] = 0.0
-    params, work = sensor[PARAMS:], scratch.predicting
+        if sensor[OFFSET] >= 0.0:
+            H[a, MOTION + int(sensor[OFFSET])] = 0.0
+    params, work = sensor[PARAMS:] if kind != ACOUSTIC else row[ROW:], scratch.predicting
     if place(state, one, gravity, derive, scratch):
         there = Epoch(scratch.R, scratch.p, scratch.v, scratch.bias, state.c)
         predict(kind, there, scratch.rate, params, z, H, work)
@@ -351,7 +354,6 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
             if len(one.window):
                 offset = MOTION + int(sensor[OFFSET])
                 for a in range(dim):
-                    H[a, offset] = 0.0
                     for i in range(3):
                         by = scratch.by_offset
                         H[a, offset] += H[a, i] * by[0, i] + H[a, 3 + i] * by[1, i] + H[a, VELOCITY_AT + i] * by[2, i]

@@ -9,6 +9,25 @@ measurement
 `SNAPSHOT`        16  motion from the keyframe: time, dR by rows, dv, dp
 `ASSUMED`          6  bias that the motion was integrated with
 `Z`, `SD`       3, 3  components, and their noise; more of each where there are more, which no kernel takes
+`CONTEXT`       0, *  where a sensor in use has it: what was known of the other end when it measured, `WIDTH` numbers
+=============  =====  ==========================================================================================
+
+=============  =====  ==========================================================================================
+context of an acoustic measurement
+=============  =====  ==========================================================================================
+`ARM`              3  of the point on the vehicle, from the state's origin, b [m]
+`ASKED`, `HEARD`  3, 3  where the other end was when it asked and when it heard, n [m]
+`FRAME`            9  attitude of the head's frame when it heard, to n, by rows; of a head on the vehicle unused
+`MOVES`, `TURNS`  3, 3  velocity of the other end in n [m/s], rate of its frame in its own axes [rad/s]
+`SEEN`             3  the direction that was measured, unit vector in the head's axes
+`WAIT`             2  time of the vehicle's part from the measurement's own: in asking, in answering [s]
+`STATED`           1  how late the stamp was taken to be for all this [s]
+`SINCE`            1  since the first of them, for a clock that drifts [s]
+`WAYS`             1  1 = one way, 2 = asked and answered
+`INVERTED`         1  1 = the head is on the vehicle, and the other end is what it sees
+`MOUNT_AT` ...    11  places in the calibration vector, or -1: the head's mounting (3), error of its arm (3), north and
+                      east of a beacon (2), its depth, scale and offset of ranges, the clock's offset and drift, lasting
+                      errors of direction (2) and of range, how late the stamp is
 =============  =====  ==========================================================================================
 
 =============  =====  ==========================================================================================
@@ -52,6 +71,11 @@ KIND, DIM, LOSS, LOSS_THRESHOLD, GATE, READMIT, SEES, SEEN_FRAME, GAIN, OFFSET, 
 )
 # a knot of a window: a snapshot from the keyframe, the rate [rad/s], how long before the stamp, nan behind the last [s]
 KNOT_DT, KNOT_RATE, KNOT_LAG, KNOT = 0, 16, 19, 20
+ARM, ASKED, HEARD, FRAME, MOVES, TURNS, SEEN, WAIT, STATED, SINCE, WAYS, INVERTED = (
+    0, 3, 6, 9, 18, 21, 24, 27, 29, 30, 31, 32
+)  # fmt: skip
+MOUNT_AT, ARM_AT, BEACON_AT, DOWN_AT, SCALE_AT, OFFSET_AT, CLOCK_AT, DRIFT_AT, DIRECTION_AT, RANGE_AT, LATE_AT = range(33, 44)
+WIDTH = 44
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
 PRELINEARISED = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
@@ -62,7 +86,7 @@ class MeasuredRows(NamedTuple):
 
     Attributes
     ----------
-    rows, which : shapes (m, ROW), (m,), and the sensor that each is of
+    rows, which : shapes (m, ROW), or (m, ROW + WIDTH) where a sensor has a context, (m,), the sensor that each is of
     scales : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
     window : shape (m,), of each whose stamp may be late, else -1
     windows : shape (w, K, KNOT), motion around such stamps

@@ -18,6 +18,8 @@ POSITION        some of (1 + k) (p + R_nb l) + offset + e, north, east, down
 PLACE_OFFSET    z = (p + R_nb l)_north,east - m, m where the place is
 WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
 TILT            z = roll and pitch of R_nb
+ACOUSTIC        z = (1 + k) r + offset + clock + e; and 0, 0, less how     ranges both ways, below
+                far the direction lies from the one that is seen
 ==============  =========================================================  ==================
 
 Arguments of `predict`:
@@ -41,6 +43,7 @@ at first can be used again and again:
     PLACE_OFFSET     rotation, translation, the last two
     WATER_VELOCITY   rotation, current
     TILT             rotation
+    ACOUSTIC         rotation, translation, velocity, and what its context names
 
 The heading, a compass's deviation and the magnetometer in full:
 
@@ -49,6 +52,15 @@ The heading, a compass's deviation and the magnetometer in full:
     compass       z = h + deviation                                       (3.17)
     magnetometer  z = |H| ((1 + s) S R_sb R_bn u(declination - deviation, dip + d) + iron)
                                                                           (3.11), (3.14), S: (3.2)
+
+An acoustic exchange in full, with the head on a ship; q is the transponder, T the head:
+
+    r = (|q(asked) - T(asked)| + |q(heard) - T(heard)|) / 2               two way; one way the second alone
+    u = R_hs R_sn (q - T) / |q - T|                                       direction in the head's axes
+    z = (B' u) a / sin a, a the angle between u and the measured m        B: across and up, both at right angles to m
+
+A bearing turns fast where the vehicle is below the ship; the two components across m do not. With the head on the
+vehicle the ends are exchanged.
 
 Signs follow the corrected equations: declination is atan2(H_e, H_n), the heading is clockwise from north.
 """
@@ -77,7 +89,32 @@ from rovgraph.kernels.layout import (
     TRANSLATION,
     VELOCITY,
 )
-from rovgraph.kernels.rotations import cross, dot, multiply, multiply_transposed, rotate, rotate_back
+from rovgraph.kernels.measurement_row import (
+    ARM,
+    ARM_AT,
+    ASKED,
+    BEACON_AT,
+    CLOCK_AT,
+    DIRECTION_AT,
+    DOWN_AT,
+    DRIFT_AT,
+    FRAME,
+    HEARD,
+    INVERTED,
+    LATE_AT,
+    MOUNT_AT,
+    MOVES,
+    OFFSET_AT,
+    RANGE_AT,
+    SCALE_AT,
+    SEEN,
+    SINCE,
+    STATED,
+    TURNS,
+    WAIT,
+    WAYS,
+)
+from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, multiply_transposed, rotate, rotate_back
 from rovgraph.kernels.states import Epoch, States
 
 
@@ -223,7 +260,8 @@ def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, 
 
 
 DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY, TILT = range(9)
-WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
+ACOUSTIC = 9
+WORK = 8  # matrices (3, 3) that `predict` needs to calculate with
 
 
 @view_helper
@@ -324,6 +362,170 @@ def water_velocity(R: Array, c: Array, z_out: Array, H_out: Array) -> None:
 
 
 @view_helper
+def _angle_factor(cosine: float) -> tuple[float, float]:
+    """a / sin a of an angle, and its slope by the cosine."""
+    if cosine > 1.0 - 1e-6:
+        return 1.0 + (1.0 - cosine) / 3.0, -1.0 / 3.0
+    square = max(1.0 - cosine * cosine, 1e-12)
+    factor = math.acos(max(cosine, -1.0)) / math.sqrt(square)
+    return factor, (cosine * factor - 1.0) / square
+
+
+@view_helper
+def _by_ends(state: Epoch, x: Array, by: Array, F: Array, late: Array, row: Array, work: Array) -> None:
+    """Derivative of a component by all that moves the ends of an exchange.
+
+    ``by``, by them when asked and when heard, in n, and a row to work with; ``F`` is the attitude of the head's frame,
+    ``late`` how the other end goes with the time offset, reversed.
+    """
+    total, body, arm, turned = work[0], work[1], work[2], by[2]
+    inverted, arm_at = x[INVERTED] != 0.0, int(x[ARM_AT])
+    for i in range(3):
+        total[i] = by[0, i] + by[1, i]
+        row[VELOCITY + i] += x[WAIT] * by[0, i] + x[WAIT + 1] * by[1, i]
+    rotate_back(state.R, total, body)
+    for i in range(3):
+        arm[i] = x[ARM + i]
+        if inverted and arm_at >= 0:
+            arm[i] += state.c[arm_at + i]
+        row[TRANSLATION + i] += body[i]
+    cross(arm, body, turned)
+    for i in range(3):
+        row[i] += turned[i]
+    if arm_at >= 0:
+        if not inverted:
+            rotate_back(F, total, body)
+        for i in range(3):
+            row[MOTION + arm_at + i] += body[i] if inverted else -body[i]
+    if x[BEACON_AT] >= 0.0:
+        row[MOTION + int(x[BEACON_AT])] -= total[0]
+        row[MOTION + int(x[BEACON_AT]) + 1] -= total[1]
+    if x[DOWN_AT] >= 0.0:
+        row[MOTION + int(x[DOWN_AT])] -= total[2]
+    if x[LATE_AT] >= 0.0:
+        row[MOTION + int(x[LATE_AT])] += dot(total, late)
+
+
+@view_helper
+def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) -> None:
+    """Range, and where there are three components direction, of an exchange whose context is ``x``."""
+    R, c, inverted = state.R, state.c, x[INVERTED] != 0.0
+    F, ends, late, by, spare = work[0], work[1], work[2, 0], work[3], work[4]
+    arm, there, error, offset = work[2, 1], work[2, 2], work[5, 0], 0.0
+    if x[LATE_AT] >= 0.0:
+        offset = c[int(x[LATE_AT])] - x[STATED]
+    for i in range(3):  # the frame that the head is mounted in
+        error[i] = 0.0 if x[ARM_AT] < 0.0 else c[int(x[ARM_AT]) + i]
+        arm[i] = x[ARM + i] + (error[i] if inverted else 0.0)
+        late[i] = 0.0 if inverted else -offset * x[TURNS + i]
+    if inverted:
+        for i in range(3):
+            for k in range(3):
+                F[i, k] = R[i, k]
+    else:
+        exp_rotation(late, work[6])
+        multiply(x[FRAME : FRAME + 9].reshape(3, 3), work[6], F)
+    rotate(R, arm, there)
+    rotate(F, error, work[5, 1])
+    cross(x[TURNS : TURNS + 3], error, work[5, 2])
+    rotate(F, work[5, 2], late)  # how the other end goes with the offset, reversed
+    for i in range(3):
+        late[i] = x[MOVES + i] + (0.0 if inverted else late[i])
+        other = offset * x[MOVES + i] - (0.0 if inverted else work[5, 1, i])
+        if i < 2 and x[BEACON_AT] >= 0.0:
+            other -= c[int(x[BEACON_AT]) + i]
+        if i == 2 and x[DOWN_AT] >= 0.0:
+            other -= c[int(x[DOWN_AT])]
+        place = state.p[i] + there[i] + other
+        ends[0, i] = place + x[WAIT] * state.v[i] - x[ASKED + i]
+        ends[1, i] = place + x[WAIT + 1] * state.v[i] - x[HEARD + i]
+    share = 0.5 if x[WAYS] == 2.0 else 1.0
+    asked, heard = max(math.sqrt(dot(ends[0], ends[0])), 1e-6), max(math.sqrt(dot(ends[1], ends[1])), 1e-6)
+    there_and_back = share * heard + (0.5 * asked if x[WAYS] == 2.0 else 0.0)
+    scale = 1.0 + (c[int(x[SCALE_AT])] if x[SCALE_AT] >= 0.0 else 0.0)
+    z_out[0] = scale * there_and_back
+    for a in range(len(z_out)):
+        for j in range(TRANSLATION + 6):
+            H_out[a, j] = 0.0
+    for at, dim in ((ARM_AT, 3), (BEACON_AT, 2), (DOWN_AT, 1), (MOUNT_AT, 3), (LATE_AT, 1)):
+        if x[at] >= 0.0:
+            for a in range(len(z_out)):
+                for j in range(dim):
+                    H_out[a, MOTION + int(x[at]) + j] = 0.0
+    for i in range(3):
+        by[0, i] = scale * 0.5 * ends[0, i] / asked if x[WAYS] == 2.0 else 0.0
+        by[1, i] = scale * share * ends[1, i] / heard
+    _by_ends(state, x, by, F, late, H_out[0], spare)
+    if x[SCALE_AT] >= 0.0:
+        H_out[0, MOTION + int(x[SCALE_AT])] = there_and_back
+    for at in (OFFSET_AT, CLOCK_AT, RANGE_AT):
+        if x[at] >= 0.0:
+            z_out[0] += c[int(x[at])]
+            H_out[0, MOTION + int(x[at])] = 1.0
+    if x[DRIFT_AT] >= 0.0:
+        z_out[0] += x[SINCE] * c[int(x[DRIFT_AT])]
+        H_out[0, MOTION + int(x[DRIFT_AT])] = x[SINCE]
+    if len(z_out) == 3:
+        _direction(state, x, F, heard, late, z_out, H_out, work)
+
+
+@view_helper
+def _direction(
+    state: Epoch, x: Array, F: Array, length: float, late: Array, z_out: Array, H_out: Array, work: Array
+) -> None:
+    """Components 1 and 2 of `acoustic`: across and up from the direction that is measured."""
+    c, inverted, mount = state.c, x[INVERTED] != 0.0, int(x[MOUNT_AT])
+    ends, by, spare, R_fh, axes = work[1], work[3], work[4], work[6], work[7]
+    u_n, u_f, u = ends[0], work[5, 0], work[5, 1]  # the end that was asked has been used
+    sense = -1.0 if inverted else 1.0
+    for i in range(3):
+        u_n[i] = sense * ends[1, i] / length
+    rotate_back(F, u_n, u_f)
+    if mount >= 0:
+        dvl_mount(c[mount], c[mount + 1], c[mount + 2], R_fh, axes)
+        rotate_back(R_fh, u_f, u)
+    else:
+        for i in range(3):
+            u[i] = u_f[i]
+    mx, my, mz = x[SEEN], x[SEEN + 1], x[SEEN + 2]
+    cosine = mx * u[0] + my * u[1] + mz * u[2]
+    factor, slope = _angle_factor(cosine)
+    level = math.sqrt(mx * mx + my * my)
+    sine, cos = (my / level, mx / level) if level > 1e-12 else (0.0, 1.0)
+    k, k_f, turned = by[2], work[5, 2], work[2, 1]
+    for a in range(1, 3):
+        ex, ey, ez = (-sine, cos, 0.0) if a == 1 else (-mz * cos, -mz * sine, level)
+        along = ex * u[0] + ey * u[1] + ez * u[2]
+        z_out[a] = factor * along
+        k[0] = factor * ex + along * slope * mx
+        k[1] = factor * ey + along * slope * my
+        k[2] = factor * ez + along * slope * mz
+        if mount >= 0:
+            rotate(R_fh, k, k_f)
+        else:
+            for i in range(3):
+                k_f[i] = k[i]
+        cross(k_f, u_f, turned)
+        if mount >= 0:
+            for j in range(3):
+                by_angle = turned[0] * axes[0, j] + turned[1] * axes[1, j] + turned[2] * axes[2, j]
+                H_out[a, MOTION + mount + j] = by_angle
+        if inverted:
+            for j in range(3):
+                H_out[a, j] += turned[j]
+        elif x[LATE_AT] >= 0.0:
+            H_out[a, MOTION + int(x[LATE_AT])] -= dot(turned, x[TURNS : TURNS + 3])
+        rotate(F, k_f, turned)
+        off = dot(turned, u_n)
+        for i in range(3):
+            by[0, i], by[1, i] = 0.0, sense * (turned[i] - off * u_n[i]) / length
+        _by_ends(state, x, by, F, late, H_out[a], spare)
+        if x[DIRECTION_AT] >= 0.0:
+            z_out[a] += c[int(x[DIRECTION_AT]) + a - 1]
+            H_out[a, MOTION + int(x[DIRECTION_AT]) + a - 1] = 1.0
+
+
+@view_helper
 def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H_out: Array, work: Array) -> None:
     """The measurement that a state predicts, and its derivatives; ``work`` has shape (WORK, 3, 3)."""
     R, p, c = state.R, state.p, state.c
@@ -341,6 +543,8 @@ def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H
         water_velocity(R, c, z_out, H_out)
     elif kind == TILT:
         tilt(R, z_out, H_out)
+    elif kind == ACOUSTIC:
+        acoustic(state, params, z_out, H_out, work)
 
 
 @kernel()

@@ -17,9 +17,9 @@ from rovgraph.log.latitudes import valid_positions
 from rovgraph.log.stamps import STEP_BACK, mend, require_moving
 from rovgraph.log.streams import (
     DATE,
-    LABEL,
     LAT_LON,
     RECEIVED,
+    SHIP_LAT_LON,
     SPACING_S,
     STREAMS,
     THRUSTER,
@@ -28,7 +28,9 @@ from rovgraph.log.streams import (
     all_columns,
     is_column,
     is_optional,
+    joined,
     label_number,
+    labels,
 )
 from rovgraph.log.tables import Table
 from rovgraph.log.units import (
@@ -200,7 +202,7 @@ def _is_known(name: str, unit: str) -> bool:
 
 def numbers(table: Table, name: str, source: str) -> Array:
     """A column with infinities taken as missing, shape (n,)."""
-    return _finite(table, name, _labels(table, source) if name == LABEL else table.numbers(source))
+    return _finite(table, name, _labels(table, source) if name in labels() else table.numbers(source))
 
 
 def _labels(table: Table, name: str) -> Array:
@@ -225,7 +227,8 @@ def _finite(table: Table, name: str, values: Array) -> Array:
 
 def _may_lack(name: str) -> bool:
     """Whether a column that stands empty is as good as none: a thruster, one of the two ways to give a fix."""
-    return name in (*LAT_LON, "fix_north", "fix_east") or THRUSTER.fullmatch(name) is not None
+    places = *LAT_LON, *SHIP_LAT_LON, "fix_north", "fix_east", "ship_north", "ship_east"
+    return name in places or THRUSTER.fullmatch(name) is not None
 
 
 def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool) -> tuple[dict[str, Array], Lines]:
@@ -263,34 +266,36 @@ def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool
 def _add_local_fixes(
     cells: dict[str, Array], line: Lines, source: str, origin: tuple[float, float] | None
 ) -> tuple[float, float] | None:
-    """Turn latitude and longitude into ``fix_north, fix_east``; unless it is stated, the origin is the first fix.
+    """Turn latitude and longitude of fixes and of the ship into north and east.
 
     Returns
     -------
-    origin : latitude and longitude [deg], or None
+    origin : latitude and longitude [deg], as stated or of the first fix, else of the ship's first position; or None
 
     Raises
     ------
     InputError : no angles in degrees; further from a stated origin than a flat frame reaches
     """
-    if not all(name in cells for name in LAT_LON):
-        return origin
-    if "fix_north" in cells and "fix_east" in cells:
-        warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
-        return origin
-    lat, lon = valid_positions(cells.pop("fix_lat"), cells.pop("fix_lon"), line, source)
-    valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
-    cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
-    if not valid.size:
-        return origin
-    origin = (float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
-    north, east, _ = pymap3d.geodetic2ned(lat[valid], lon[valid], 0.0, *origin, 0.0)
-    if (away := float(np.median(np.hypot(north, east)))) > FARTHEST:
-        raise InputError(
-            f"{source}: fixes lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
-            f"{origin[0]:g}, {origin[1]:g}; correct them, or remove these keys to use the first fix"
-        )
-    cells["fix_north"][valid], cells["fix_east"][valid] = north, east
+    for of, what in (("fix", "fixes"), ("ship", "the ship's positions")):
+        lat_lon, local = (f"{of}_lat", f"{of}_lon"), (f"{of}_north", f"{of}_east")
+        if not all(name in cells for name in lat_lon):
+            continue
+        if all(name in cells for name in local):
+            warn(f"{source}: {lat_lon[0]} and {lat_lon[1]} are ignored beside {local[0]} and {local[1]}")
+            continue
+        lat, lon = valid_positions(*(cells.pop(name) for name in lat_lon), line, source)
+        valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
+        cells[local[0]], cells[local[1]] = lat * np.nan, lon * np.nan
+        if not valid.size:
+            continue
+        origin = (float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
+        north, east, _ = pymap3d.geodetic2ned(lat[valid], lon[valid], 0.0, *origin, 0.0)
+        if (away := float(np.median(np.hypot(north, east)))) > FARTHEST:
+            raise InputError(
+                f"{source}: {what} lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
+                f"{origin[0]:g}, {origin[1]:g}; correct them, or remove these keys to use the first fix"
+            )
+        cells[local[0]][valid], cells[local[1]][valid] = north, east
     return origin
 
 
@@ -306,6 +311,8 @@ def _select(
     """
     required = [c for c in columns if not is_optional(c)]
     absent = [c for c in required if c not in cells]
+    if not any(c in cells for c in columns):
+        return None
     if absent:
         if len(absent) < len(required):
             present = [c for c in required if c in cells]
@@ -316,6 +323,8 @@ def _select(
     complete, partly = filled.all(axis=1), filled.any(axis=1)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
+    if sensor in SENSORS and (several := SENSORS[sensor].complete) is not None:
+        complete, partly = several(data), ~np.isnan(data).all(axis=1)
     for column in SENSORS[sensor].columns if sensor in SENSORS else ():
         if column.is_sd:
             _known_sd(column, data[:, columns.index(column.name)], line, source)
@@ -430,7 +439,20 @@ def _interpolated(at: Array, time: Array, values: Array) -> tuple[Array, Bools]:
 
 
 def _distinct_times(stream: Stream, source: str) -> Stream:
-    """A stream with one measurement at a time, the first; those within `SPACING_S` are of one time."""
+    """A stream with one measurement at a time, the first; those within `SPACING_S` are of one time.
+
+    What is measured of several beacons or places at a time is kept.
+    """
+    names = [stream.columns.index(name) for name in stream.columns if name in labels()]
+    if names:
+        of = np.unique(np.nan_to_num(stream.data[:, names], nan=-1.0), axis=0, return_inverse=True)[1].ravel()
+        if of.any():
+            return joined([_distinct(stream.take(of == k), source) for k in range(of.max() + 1)])
+    return _distinct(stream, source)
+
+
+def _distinct(stream: Stream, source: str) -> Stream:
+    """The same of one beacon or place."""
     require_moving(stream.time, f"{source}: {stream.sensor}")
     close = np.flatnonzero(np.diff(stream.time) < SPACING_S) + 1
     if not len(close):

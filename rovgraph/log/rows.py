@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.log.disk_columns import release
-from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, all_columns
+from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, STREAMS, all_columns, labels
 from rovgraph.log.tables import Table
 
 STAMP_DIGITS = 6  # of a second, as a log is written
@@ -128,8 +128,8 @@ def frame_of(rows: Sequence[Rows]) -> pd.DataFrame:
             for name, values in part.columns.items():
                 columns[name][part.place] = values
     frame = pd.DataFrame(columns, copy=False)
-    if LABEL in frame:
-        frame[LABEL] = frame[LABEL].astype("Int64")
+    for name in labels() & {*frame}:
+        frame[name] = frame[name].astype("Int64")
     return frame
 
 
@@ -154,4 +154,6 @@ def _fed(rows: Rows) -> set[str]:
     fed = {sensor for sensor, columns in STREAMS.items() if held.intersection(columns)}
     if held.intersection(LAT_LON):
         fed.add("fix")
+    if held.intersection(SHIP_LAT_LON):
+        fed.add("ship")
     return fed or {"thruster"}

@@ -30,8 +30,8 @@ class _Streams(Mapping[str, tuple[str, ...]]):
 
 
 STREAMS: Mapping[str, tuple[str, ...]] = _Streams()  # sensor -> its columns
-LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
+SHIP_LAT_LON = ("ship_lat", "ship_lon")
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
 VERSION_COLUMN = "rovgraph_log"  # version of the log's form; without this column it is 1
 DATE = "date"  # day, or GPS week, of the times beside it
@@ -42,12 +42,17 @@ THRUSTER = re.compile(r"thruster_[1-9]\d*")
 
 def all_columns() -> tuple[str, ...]:
     """Columns that a log may have, but for thrusters."""
-    return ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
+    return ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON, *SHIP_LAT_LON)
+
+
+def labels() -> set[str]:
+    """Columns of names, not of quantities."""
+    return {column.name for sensor in SENSORS.values() for column in sensor.columns if column.label}
 
 
 def is_column(name: str) -> bool:
     """Whether a log may have a column of this name."""
-    others = name == "time" or name in LAT_LON or THRUSTER.fullmatch(name) is not None
+    others = name == "time" or name in (*LAT_LON, *SHIP_LAT_LON) or THRUSTER.fullmatch(name) is not None
     return others or any(name in sensor.column_names for sensor in SENSORS.values())
 
 

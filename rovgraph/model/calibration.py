@@ -150,8 +150,26 @@ def _time_offset(
     return Variable(prefix + _TIME_OFFSET, letter, _ONE, "s", sd, sensors, about, excited_by)
 
 
+ACOUSTICS = "usbl", "range"  # log streams
+BEACONS = 8  # that a dive may have
+_MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
+
+
+def _beacon(k: int) -> tuple[Variable, Variable]:
+    """North and east of an acoustic beacon, and its depth; `Config.beacons` states their priors."""
+    shown = "a path about it, with turns; ranges alone leave a mirrored place on a straight leg"
+    about = f"beacon {k + 1} of beacons"
+    place = f"beacon_{k + 1}", _MARKS[2 * k], ("_north", "_east"), "m", 1000.0, ACOUSTICS
+    down = f"beacon_{k + 1}_down", _MARKS[2 * k + 1], _ONE, "m", 10.0, ACOUSTICS
+    return (
+        Variable(*place, f"place of {about}, north and east", shown, estimate=True),
+        Variable(*down, f"depth of {about}", "passing near it; the depth that a chart or a sounder shows", estimate=True),
+    )
+
+
 STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
 MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")  # of the DVL's axes in the body's
+USBL_MOUNT = ("usbl_roll", "usbl_pitch", "usbl_yaw")  # of the acoustic head's axes in its frame's
 
 TABLE: dict[str, Variable] = {
     v.name: v
@@ -423,6 +441,134 @@ TABLE: dict[str, Variable] = {
             "motion up and down that the DVL measures better over its time constant",
             time_constant=60.0,
         ),
+        *(
+            Variable(
+                f"usbl_{name}",
+                letter,
+                _ONE,
+                "rad",
+                sd * _DEG,
+                ("usbl",),
+                f"{name} of the acoustic head's axes in the frame that it states{more}",
+                shown,
+                estimate=True,
+            )
+            for name, letter, sd, more, shown in (
+                ("roll", "B", 1.0, "", "depths from a pressure sensor, with the vehicle to port and to starboard"),
+                ("pitch", "E", 1.0, "", "depths from a pressure sensor, with the vehicle ahead and astern"),
+                (
+                    "yaw",
+                    "G",
+                    3.0,
+                    ", and the ship's compass with it",
+                    "a track beside the ship that a compass or position fixes orient; far from below it",
+                ),
+            )
+        ),
+        Variable(
+            "usbl_arm",
+            "H",
+            _XYZ,
+            "m",
+            0.3,
+            ("usbl",),
+            "error of the acoustic head's place, usbl.lever_arm_m less ship.antenna_m, axes of its carrier",
+            "the ship on several headings; the vehicle below it",
+            considered=True,
+        ),
+        Variable(
+            "sound_speed_scale",
+            "I",
+            _ONE,
+            "1",
+            0.01,
+            ACOUSTICS,
+            "scale error of acoustic ranges (sound speed)",
+            "ranges of different lengths beside positions or depths that are known; a DVL over far changes of range",
+            estimate=True,
+        ),
+        Variable(
+            "usbl_range_offset",
+            "J",
+            _ONE,
+            "m",
+            0.1,
+            ("usbl",),
+            "offset of the head's ranges (turn-around time: 1 ms both ways is 0.75 m)",
+            "ranges of different lengths",
+            considered=True,
+        ),
+        _time_offset(
+            "usbl", "K", 0.5, ("usbl",), "the stamps of acoustic positions are", "the ship turning, or legs beside a DVL"
+        ),
+        Variable(
+            "usbl_direction_error",
+            "L",
+            ("_across", "_up"),
+            "rad",
+            0.3 * _DEG,
+            ("usbl",),
+            "error of the acoustic direction that lasts (the ship's compass, ray bending)",
+            "motion that the IMU and the DVL measure better over its time constant",
+            time_constant=600.0,
+        ),
+        Variable(
+            "usbl_range_error",
+            "N",
+            _ONE,
+            "m",
+            0.5,
+            ("usbl",),
+            "error of the head's ranges that lasts (multipath, a filter in the instrument)",
+            "motion that the IMU and the DVL measure better over its time constant",
+            time_constant=60.0,
+        ),
+        Variable(
+            "range_offset",
+            "O",
+            _ONE,
+            "m",
+            0.1,
+            ("range",),
+            "offset of ranges to beacons (turn-around time: 1 ms both ways is 0.75 m)",
+            "ranges of different lengths",
+            considered=True,
+        ),
+        Variable(
+            "range_clock",
+            "P",
+            _ONE,
+            "m",
+            1e4,  # 7 s of sound
+            ("range",),
+            "offset of the clocks of one-way ranges, as a length",
+            "several beacons, or a path about one whose place is known",
+            estimate=True,
+        ),
+        Variable(
+            "range_clock_drift",
+            "Q",
+            _ONE,
+            "m/s",
+            0.02,  # 13 ppm of a quartz, at 1500 m/s
+            ("range",),
+            "drift of the clocks of one-way ranges, as a speed",
+            "a dive of an hour with several beacons",
+            estimate=True,
+        ),
+        Variable(
+            "range_error",
+            "R",
+            _ONE,
+            "m",
+            0.5,
+            ("range",),
+            "error of ranges to beacons that lasts (multipath, a clock)",
+            "motion that the IMU and the DVL measure better over its time constant",
+            time_constant=60.0,
+        ),
+        _time_offset("range", "S", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"),
+        *(variable for k in range(BEACONS) for variable in _beacon(k)),
     )
 }
 

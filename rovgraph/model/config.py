@@ -17,6 +17,7 @@ widest offset is 250 sqrt(Hz) d.
 import io
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_origin
 
@@ -30,7 +31,7 @@ from ruamel.yaml.error import YAMLError
 from rovgraph import compatibility
 from rovgraph.errors import InputError, as_path, kind_of, warn
 from rovgraph.geometry import Array, matrix_from_rpy
-from rovgraph.model.calibration import AUTO, CONSIDERED, MOUNT, TABLE, Belief, Variable
+from rovgraph.model.calibration import AUTO, BEACONS, CONSIDERED, MOUNT, TABLE, USBL_MOUNT, Belief, Variable
 from rovgraph.model.config_errors import complaint, count
 from rovgraph.model.config_sections import (
     ANGLES_TEXT,
@@ -38,6 +39,7 @@ from rovgraph.model.config_sections import (
     COLUMNS_TEXT,
     UNITS_TEXT,
     Angles,
+    Beacon,
     ConfigSection,
     DateSettings,
     Delays,
@@ -56,12 +58,15 @@ from rovgraph.model.config_sections import (
     OnlineSettings,
     Place,
     Positive,
+    RangeSettings,
     RegisteredSensors,
     SensorSettings,
+    ShipSettings,
     StartSettings,
     TableSettings,
     TiltSettings,
     Triple,
+    Usbl,
     Vehicle,
 )
 from rovgraph.model.gauss_markov import stationary_walk
@@ -168,7 +173,7 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     tail = "_deg" if variable.angular else ""
     scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
     unit = "degrees" if variable.angular else variable.unit
-    mounted = variable.name in MOUNT
+    mounted = variable.name in (*MOUNT, *USBL_MOUNT)
     kind, default, choices = _estimate_of(variable)
     fields: dict[str, Any] = {
         "estimate": (
@@ -262,6 +267,12 @@ class Config(ConfigSection):
     depth: Depth = Depth()
     fix: Fix = Fix()
     place: Place = Place()
+    usbl: Usbl = Usbl()
+    range: RangeSettings = RangeSettings()
+    ship: ShipSettings = ShipSettings()
+    beacons: tuple[Beacon, ...] = Field(
+        (), max_length=BEACONS, description="acoustic beacons on the bottom: name, and north_m, east_m, down_m where known"
+    )
     sensors: RegisteredSensors = Field(default_factory=RegisteredSensors)
     calibration: Calibration = Field(default_factory=Calibration)
     vehicle: Vehicle = Vehicle()
@@ -395,9 +406,10 @@ def mount_matrix(rpy_deg: Triple) -> Array:
 def beliefs(config: Config) -> dict[str, Belief]:
     """The prior of every calibration variable, in the order of the table.
 
-    The mean of the DVL's angles is its mounting where the configuration gives none.
+    Where the configuration gives no mean, that of a mounting's angles is the mounting, and of a beacon its place.
     """
     mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
+    mount |= dict(zip(USBL_MOUNT, config.usbl.mount_rpy_deg, strict=True))
     out = {}
     for name, variable in TABLE.items():
         entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
@@ -417,6 +429,12 @@ def beliefs(config: Config) -> dict[str, Belief]:
             entry.estimate == CONSIDERED,
             np.inf if lasts is None else lasts,
         )
+    for k, beacon in enumerate(config.beacons):
+        place, down = f"beacon_{k + 1}", f"beacon_{k + 1}_down"
+        if beacon.north_m is not None and beacon.east_m is not None:
+            out[place] = replace(out[place], mean=np.array([beacon.north_m, beacon.east_m]), sd=beacon.sd_m)
+        if beacon.down_m is not None:
+            out[down] = replace(out[down], mean=np.array([beacon.down_m]), sd=beacon.down_sd_m)
     return out
 
 

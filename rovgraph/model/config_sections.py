@@ -25,7 +25,7 @@ NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = (
     *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
-    *("depth", "fix", "place", "thruster"),
+    *("depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
 )
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
@@ -223,6 +223,79 @@ class Place(ConfigSection):
     )
     loss: Loss = Field("cauchy", description="robust loss")
     gate_sd: Positive | None = Field(4.0, description="an observation further off than this many sd is a false match")
+
+
+class ShipSettings(ConfigSection):
+    """The vessel that carries acoustic heads and receivers; its arms start at a point of it on the waterline."""
+
+    antenna_m: Triple = Field((0.0, 0.0, 0.0), description="position of its antenna in ship axes, from the waterline")
+    sd_m: NotNegative = Field(0.5, description="noise of its position, north and east; ship_sd takes precedence")
+    heading_sd_deg: NotNegative = Field(0.3, description="noise of its heading")
+    tilt_sd_deg: NotNegative = Field(0.1, description="noise of its roll and pitch")
+    north_m: float | None = Field(None, description="north of an antenna that does not move; null = ship_north")
+    east_m: float | None = Field(None, description="east of it; null = ship_east")
+    heading_deg: float | None = Field(None, description="heading of what does not turn; null = ship_heading")
+    max_gap_s: Positive = Field(3.0, description="its position and attitude are interpolated over no longer silence")
+    receivers: dict[str, Triple] = Field(
+        default_factory=dict, description="name of a receiver of ranges: its position in ship axes, from the waterline"
+    )
+
+
+class AcousticSettings(ConfigSection):
+    """Keys that directions and ranges share."""
+
+    sound_speed_mps: Positive = Field(1500.0, description="speed of sound that ranges were made with, and travel times")
+    stamp: Literal["reply", "transponder", "arrival"] = Field(
+        "reply",
+        description="what a stamp is the time of: the reply at the head, the question at the transponder, "
+        "or the message's arrival",
+    )
+    turn_around_s: NotNegative = Field(0.0, description="time between hearing and answering, taken out of ranges")
+    one_way: bool = Field(False, description="the other end sends by its clock and is not asked")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is rejected")
+    readmit_s: Readmission = 300.0
+
+
+class Usbl(AcousticSettings):
+    """Acoustic positions by direction and range (USBL), the head on the ship or on the vehicle."""
+
+    head: Literal["ship", "vehicle"] = Field("ship", description="what carries the head")
+    frame: Literal["transducer", "ship", "north"] = Field(
+        "transducer",
+        description="axes of direction: the head's; the ship's, made level; north, east, down with the ship's compass",
+    )
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the head in axes of what carries it")
+    beacon_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the transponder in axes of what carries it")
+    mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw of the head's axes in the frame's")
+    beacon: str | int | None = Field(None, description="usbl_beacon of the vehicle's transponder; null = the only one")
+    range_sd_m: Positive = Field(0.3, description="noise of a range; usbl_range_sd takes precedence")
+    angle_sd_deg: Positive = Field(1.0, description="noise of a direction; usbl_angle_sd takes precedence")
+    planar: bool = Field(True, description="a head that looks down: less precise towards its horizon")
+
+
+class RangeSettings(AcousticSettings):
+    """Ranges to beacons, or to receivers on the ship."""
+
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the transducer in body axes")
+    sd_m: Positive = Field(0.5, description="noise of a range; range_sd takes precedence")
+
+
+class Beacon(ConfigSection):
+    """An acoustic beacon on the bottom; without a place it is found."""
+
+    name: str | int = Field(description="as range_beacon or usbl_beacon have it")
+    north_m: float | None = Field(None, description="north; null = unknown")
+    east_m: float | None = Field(None, description="east; null = unknown")
+    down_m: float | None = Field(None, description="depth; null = unknown")
+    sd_m: Positive = Field(1.0, description="sd of north and of east, where they are stated")
+    down_sd_m: Positive = Field(1.0, description="sd of the depth, where it is stated")
+
+    @model_validator(mode="after")
+    def _whole_place(self) -> Self:
+        if (self.north_m is None) != (self.east_m is None):
+            raise PydanticCustomError("half", "expected both north_m and east_m, or neither")
+        return self
 
 
 class SensorSettings(ConfigSection):

@@ -23,13 +23,14 @@ from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.measurement_row import KNOT, MOST, Z
+from rovgraph.kernels.measurement_row import KNOT, MOST, WIDTH, Z
 from rovgraph.kernels.preintegration import HALF_WINDOW_S
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
-from rovgraph.model.calibration import Belief
+from rovgraph.model.calibration import ACOUSTICS, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.model.state import PLACE
+from rovgraph.problem.acoustics import SHIP, Acoustics
 from rovgraph.problem.admission import TimeOffsets, admitted, pack, thruster_pieces, unpack
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -95,15 +96,18 @@ class Assembly:
         self.names = tuple(self.instruments)
         self._which = {sensor: k for k, sensor in enumerate(self.names)}
         self._no_imu = has_constant_velocity(self.config)
-        self._rule = self._make_rule(believed)
-        self._integration = self._make_integration()
         self._sensors = np.array([self._about(s) for s in self.names], np.int64).reshape(-1, at.ABOUT)
         dims = [i.model.dim for i in self.instruments.values()]
         self._most = max([MOST, *dims])
+        self._acoustics = Acoustics(self.config, self.instruments)
+        self._context = WIDTH if self._acoustics.instruments else 0
+        self._wide = 2 * self._most + self._context  # components, sds and context of a measurement
+        self._rule = self._make_rule(believed)
+        self._integration = self._make_integration()
         self._R_sb = mount_matrix(self.config.imu.mount_rpy_deg).T
         self._imu, self._samples = np.empty((BUFFER, 7)), 0
         self._fresh: list[tuple[float, Array]] = []  # samples that have no row yet
-        self._listed, self._come = np.empty((BUFFER, at.VALUES + 2 * self._most)), 0
+        self._listed, self._come = np.empty((BUFFER, at.VALUES + self._wide)), 0
         self._waiting: list[Measurement] = []  # that have no row yet, in their order after all that have
         self._last = NEVER  # place of the last of all
         self._rank = {s: (precedence(s), k) for s, k in self._which.items()}
@@ -131,6 +135,7 @@ class Assembly:
         InputError : an IMU gap longer than ``imu.max_gap_s``
         """
         streams = {s: x for s, x in log.streams.items() if s in self.instruments and s != "thruster"}
+        self._acoustics.take_ship(log.streams)
         imu = log.streams.get("imu")
         if self._no_imu:
             time = ticks(log).time
@@ -152,7 +157,10 @@ class Assembly:
         admissible = []
         for sensor, stream in streams.items():
             mask = admitted(sensor, stream.data, self.config, self._left_out)
-            admissible.append(stream if mask.all() else stream.take(mask))
+            stream = stream if mask.all() else stream.take(mask)
+            if sensor in self._acoustics.instruments:
+                stream = self._acoustics.exchanges(stream, self.time_offsets.of_sensor(sensor), self._left_out)
+            admissible.append(stream)
         if admissible:
             admissible.sort(key=lambda stream: self._which[stream.sensor])
             self._listed = self._wanted(in_precedence(admissible))
@@ -174,6 +182,23 @@ class Assembly:
             return InsertResult.LATE
         if m.sensor == "imu":
             return InsertResult.IN if self._no_imu else self._insert_sample(m.time, m.values[:6], m.row)
+        if m.sensor in SHIP or m.sensor in self._acoustics.instruments:
+            return self._insert_acoustic(m, settled)
+        return self._insert(m)
+
+    def _insert_acoustic(self, m: Measurement, settled: float) -> InsertResult:
+        """Take what the ship or an acoustic system says, and exchanges that it completes."""
+        if m.sensor in self._acoustics.instruments:
+            if not admitted(m.sensor, m.values[None], self.config, self._left_out).all():
+                return InsertResult.IN
+        late = max((self.time_offsets.of_sensor(s) for s in self._acoustics.instruments), default=0.0)
+        results = [
+            self._insert(one) if one.time >= settled else InsertResult.LATE
+            for one in self._acoustics.insert(m, late, self._left_out)
+        ]
+        return next((result for result in results if result != InsertResult.IN), InsertResult.IN)
+
+    def _insert(self, m: Measurement) -> InsertResult:
         known = m.sensor in self._which
         if m.sensor == "thruster" and known:
             k = bisect_left(self._signals, m.time, key=_time)
@@ -374,6 +399,7 @@ class Assembly:
             self._integration.row[motion_row.BIAS : motion_row.BIAS + 6],
             self._table,
             int(d.counts[at.FORGOTTEN]),
+            context=self._context,
         )
 
     def ahead(self, time: float, x: Array) -> Problem:
@@ -429,6 +455,9 @@ class Assembly:
             "periods": list(self._periods),
             "gaps": list(self._gaps),
             "signals": pack(twin._signals),
+            "ship": self._acoustics.state(),
+            "waiting": pack(self._acoustics.waiting),
+            "context": self._context,
             "assumed": self.time_offsets.assumed,
         }
 
@@ -438,10 +467,14 @@ class Assembly:
         number = np.array([self._which[sensor] for sensor in state["sensors"]], np.int64)
         self._imu, self._samples, self._fresh = np.array(state["imu"], float), len(state["imu"]), []
         self.newest = float(self._imu[-1, 0])
-        self._come, most = len(events), (events.shape[1] - at.VALUES) // 2
-        self._listed, self._waiting = np.zeros((self._come, at.VALUES + 2 * self._most)), []
-        self._listed[:, : at.VALUES + most] = events[:, : at.VALUES + most]
-        self._listed[:, at.VALUES + self._most : at.VALUES + self._most + most] = events[:, at.VALUES + most :]
+        context = int(state.get("context", 0))
+        self._come, most = len(events), (events.shape[1] - at.VALUES - context) // 2
+        self._listed, self._waiting = np.zeros((self._come, at.VALUES + self._wide)), []
+        ends = at.VALUES + most, at.VALUES + 2 * most
+        self._listed[:, : ends[0]] = events[:, : ends[0]]
+        self._listed[:, at.VALUES + self._most : at.VALUES + self._most + most] = events[:, ends[0] : ends[1]]
+        if context:
+            self._listed[:, -context:] = events[:, ends[1] :]
         self._listed[:, at.SENSOR] = number[events[:, at.SENSOR].astype(np.int64)]
         self._last = self._place_of(self._come - 1)
         self._order = np.append(np.array(state["order"], np.int64), np.empty(self._come, np.int64))
@@ -457,6 +490,9 @@ class Assembly:
         self._dive.of[at.WHICH] = number[self._dive.of[at.WHICH]]
         self.forgotten, self._reasons = int(state["forgotten"]), list(state["reasons"])
         self._gaps, self._signals = list(state["gaps"]), unpack(state["signals"])
+        if "ship" in state:
+            self._acoustics.restore(state["ship"])
+            self._acoustics.waiting = unpack(state["waiting"])
         self._periods, self._steps[:] = [], math.inf
         for period in state["periods"]:
             self._take_period(period)
@@ -468,6 +504,7 @@ class Assembly:
         table, events, twin = self._table, self._events, copy(self)
         twin._imu, twin._listed, twin._order = table.copy(), events.copy(), self._order.copy()
         twin._fresh, twin._waiting, twin._signals, twin._no_pieces = [], [], self._signals[:], self._no_pieces[:]
+        twin._acoustics = self._acoustics.copy()
         twin._left_out, twin._dive = self._left_out.copy(), at.DiveArrays._make(array.copy() for array in self._dive)
         return twin
 
@@ -508,7 +545,7 @@ class Assembly:
 
     @property
     def _events(self) -> Array:
-        """Events so far, in the order of time, shape (e, VALUES + 2 D)."""
+        """Events so far, in the order of time, shape (e, VALUES + 2 D + context)."""
         if self._waiting:
             new, begin = self._waiting, self._come
             self._waiting, self._come = [], begin + len(new)
@@ -536,7 +573,7 @@ class Assembly:
             np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes, MOTION, MOTION)),
             np.zeros((keyframes * scaled, 6, 6)),
-            np.zeros((rows, Z + 2 * self._most)),
+            np.zeros((rows, Z + self._wide)),
             np.zeros((rows * scaled, 6, 6)),
             np.zeros((at.OF, rows), np.int64),
             np.zeros((windows, knots, KNOT)),
@@ -558,6 +595,7 @@ class Assembly:
             learns=float(self.learn_noise and not self._no_imu),
             scaled=float(wanted(believed)),
             rate_sd=math.radians(config.motion.rate_sd_dps),
+            context=float(self._context),
         )
 
     def _make_integration(self) -> at.Integration:
@@ -600,7 +638,8 @@ class Assembly:
         """Events of a sensor's measurements, with why they are refused, if they are."""
         values = np.array([m.values for m in some])
         out = self._rows_of(sensor, np.array([m.time for m in some]), values, np.array([m.row for m in some]))
-        for why, bad in SENSORS[sensor].refused(values, self.config):
+        acoustic = sensor in self._acoustics.instruments  # judged as they came
+        for why, bad in () if acoustic else SENSORS[sensor].refused(values, self.config):
             if bad.any():
                 if why not in self._reasons:
                     self._reasons.append(why)
@@ -608,10 +647,15 @@ class Assembly:
         return out
 
     def _rows_of(self, sensor: str, time: Array, values: Array, line: NDArray[np.int64]) -> Array:
-        """Events of n measurements of a sensor, shape (n, VALUES + 2 D)."""
+        """Events of n measurements of a sensor, shape (n, VALUES + 2 D + context)."""
         instrument, registered, D = self.instruments[sensor], SENSORS[sensor], self._most
-        out, dim = np.zeros((len(time), at.VALUES + 2 * D)), instrument.model.dim
+        out, dim = np.zeros((len(time), at.VALUES + self._wide)), instrument.model.dim
         out[:, at.STAMP], out[:, at.SENSOR], out[:, at.LINE] = time, self._which[sensor], line
+        if sensor in self._acoustics.instruments:
+            out[:, at.VALUES : at.VALUES + dim] = values[:, :dim]
+            out[:, at.VALUES + D : at.VALUES + D + dim] = values[:, dim : 2 * dim]
+            out[:, at.VALUES + 2 * D :], out[:, at.NAME] = values[:, 2 * dim : -1], values[:, -1]
+            return out
         if sensor == PLACE:
             out[:, at.NAME] = values[:, 0]
         else:
@@ -695,7 +739,7 @@ class Assembly:
                     first = (np.diff(before, prepend=-1) > 0) | (np.diff(after, prepend=-1) > 0)
                     wanted[rows] = whole[after] | whole[before] | first
         which, index = which[wanted], index[wanted]
-        events = np.empty((len(which), at.VALUES + 2 * self._most))
+        events = np.empty((len(which), at.VALUES + self._wide))
         for k, stream in enumerate(streams):
             rows = which == k
             some = index[rows]
@@ -755,5 +799,7 @@ def _time(m: Measurement) -> float:
 
 
 def _name(m: Measurement) -> float:
-    """Of a place that is seen, else 0."""
+    """Of a place that is seen or of the other end of an acoustic exchange, else 0."""
+    if m.sensor in ACOUSTICS:
+        return float(m.values[-1])
     return float(m.values[0]) if m.sensor == PLACE else 0.0

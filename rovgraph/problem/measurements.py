@@ -31,7 +31,7 @@ from rovgraph.model.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY, Jacobia
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.motion import COLUMNS, SCALES
 from rovgraph.problem.problem import Index, Problem
-from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors import SENSORS, AcousticExchange, SensorModel, innovation
 from rovgraph.sensors.instruments import Instrument
 
 Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are admitted
@@ -205,16 +205,22 @@ class Measurements:
         """Some of the measurements."""
         return replace(self, index=self.index[index])
 
+    @property
+    def model(self) -> SensorModel:
+        """Their model, with what was known of the other ends."""
+        model = self.instrument.model
+        return model.of(self.problem.contexts(self.index)) if isinstance(model, AcousticExchange) else model
+
     # predictions
 
     def predicted(self, state: State) -> Array:
         """Predicted measurements, shape (n, dim); ``state`` is at each one's keyframe."""
         there, rate_b, _ = self._placed(state, False)
-        return self.instrument.model.predict(there, rate_b)[0]
+        return self.model.predict(there, rate_b)[0]
 
     def innovations(self, state: State) -> Array:
         """Measured minus predicted, shape (n, dim)."""
-        return innovation(self.instrument.model, self.z, self.predicted(state))
+        return innovation(self.model, self.z, self.predicted(state))
 
     def normalised(self, state: State) -> Array:
         """Whitened innovations, shape (n, dim)."""
@@ -252,7 +258,7 @@ class Measurements:
     def predict(self, state: State) -> tuple[Array, Jacobians]:
         """Predictions of a model without a kernel, shape (n, dim), and Jacobians by the keyframes' variables."""
         there, rate_b, F = self._placed(state, True)
-        predicted, H = self.instrument.model.predict(there, rate_b)
+        predicted, H = self.model.predict(there, rate_b)
         n, stacked = len(self), np.zeros((len(self), predicted.shape[1], MOTION))
         for variable, columns in _COLUMNS.items():
             if variable in H:

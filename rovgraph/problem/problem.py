@@ -48,6 +48,7 @@ class Problem:
     bias : ndarray, shape (6,), that motions are integrated with
     imu, forgotten : ndarray, shape (k, 7), samples in body axes, and how many there were before them
     doubted : measurements of places where the vehicle cannot have been, by their index
+    context : numbers of a measurement's context at the end of ``rows``, 0 where no sensor has one
     """
 
     sensors: tuple[str, ...]
@@ -67,6 +68,7 @@ class Problem:
     imu: Array
     forgotten: int
     doubted: frozenset[int] = frozenset()
+    context: int = 0
 
     def __len__(self) -> int:
         """Count of keyframes."""
@@ -169,6 +171,10 @@ class Problem:
         """Their noise, shape (k, dim)."""
         return self.rows[index, sd_of(dim) : sd_of(dim) + dim]
 
+    def contexts(self, index: "slice | Index") -> Array:
+        """What was known of the other end of measurements, shape (k, context)."""
+        return self.rows[index, self.rows.shape[1] - self.context :]
+
     @cached_property
     def taken(self) -> Index:
         """Measurements up to the end of each interval, shape (n,)."""
@@ -182,6 +188,8 @@ class Problem:
     def measured(self, some: "slice | Index" = slice(None)) -> MeasuredRows:
         """Measurements as kernels take them."""
         rows, which, window = self.rows[some, : measured.ROW], self.which[some], self.window[some]
+        if self.context:
+            rows = np.hstack([rows, self.contexts(some)])
         scales = self.row_scales[some] if len(self.row_scales) else self.row_scales
         contiguous = np.ascontiguousarray
         return MeasuredRows(contiguous(rows), contiguous(which), scales, contiguous(window), self.windows)

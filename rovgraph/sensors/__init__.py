@@ -6,6 +6,7 @@ stream. The equations are in `rovgraph.kernels.measurements`. docs/own-sensor.md
 own.
 """
 
+from rovgraph.sensors.acoustic import RANGE, SHIP, SHIP_HEADING, SHIP_TILT, USBL, AcousticExchange
 from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, VEHICLE_TILT, CompassHeading, Tilt
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
@@ -33,6 +34,7 @@ __all__ = [
     "DEFAULT_DIP",
     "MOSTLY",
     "SENSORS",
+    "AcousticExchange",
     "Column",
     "CompassHeading",
     "CompiledModel",
@@ -77,5 +79,7 @@ IMU = Sensor(  # it carries the estimate from one measurement to the next
 )
 
 _VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
-for _sensor in (IMU, MAG, AHRS, *_VEHICLE, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):
+_DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE
+_ACOUSTIC = USBL, RANGE, SHIP, SHIP_HEADING, SHIP_TILT
+for _sensor in (IMU, MAG, AHRS, *_VEHICLE, *_DVL, DEPTH, FIX, SEEN_PLACE, *_ACOUSTIC, THRUSTER):
     SENSORS[_sensor.name] = _sensor

@@ -166,7 +166,7 @@ def recognition(config: Config, origin_b: Array) -> Instrument:
 
 SEEN_PLACE = Sensor(
     "place",
-    (Column("place_id"), Column("place_sd", "length", optional=True, largest=5e3)),
+    (Column("place_id", label=True), Column("place_sd", "length", optional=True, largest=5e3)),
     recognition,
     standard_deviation=own_sd(1),
     observes=Observed("position", (0, 1)),

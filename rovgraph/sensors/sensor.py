@@ -18,7 +18,7 @@ from rovgraph.model.calibration import Variable
 from rovgraph.model.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.sensors.model import SensorModel
 
-RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that belong to no sensor
+RESERVED = ("time", "received", "fix_lat", "fix_lon", "ship_lat", "ship_lon")  # columns of a log that belong to no sensor
 LARGEST_SD = 1e6  # of a measurement's own: larger ones add no information, and overflow
 NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 99.9, 99.99, 999 ...
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
@@ -50,6 +50,7 @@ class Column:
     optional : a measurement is complete without it
     group : the name under which a log's unit is declared; None = the sensor's
     largest : of a measurement's own sd, the limit of such instruments; None = it has no sd, or one of any size
+    label : it holds names, as text or numbers
     """
 
     name: str
@@ -57,6 +58,7 @@ class Column:
     optional: bool = False
     group: str | None = None
     largest: float | None = None
+    label: bool = False
 
     def __post_init__(self) -> None:
         if self.quantity is not None and self.quantity not in get_args(Quantity):
@@ -112,7 +114,7 @@ class Instrument:
     def calibration(self) -> tuple[str, ...]:
         """Calibration variables that its measurements depend on."""
         of_model = self.model.calibration
-        return of_model if self.time_offset is None else (*of_model, self.time_offset)
+        return of_model if self.time_offset in (None, *of_model) else (*of_model, str(self.time_offset))
 
 
 class Limits(Protocol):
@@ -215,6 +217,8 @@ class Sensor:
     simulated_hz : rate at which a simulated dive samples its model with white noise; None = the simulator has a
         sampler of its own for it, or none
     calibration : variables that come with it, beside the built-in ones
+    complete : from columns, shape (n, k), to the rows that are measurements, for one that may be written in several
+        ways; None = those with all columns that are not optional
     settings : keys of its section of the configuration, under ``sensors``; None = those of `SensorSettings`
     """
 
@@ -234,6 +238,7 @@ class Sensor:
     look: Callable[[Array, Config], Iterator[Said]] = nothing_found
     simulated_hz: float | None = None
     calibration: tuple[Variable, ...] = ()
+    complete: Callable[[Array], NDArray[np.bool_]] | None = None
     settings: type[SensorSettings] | None = None
 
     @cached_property

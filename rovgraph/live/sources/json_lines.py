@@ -17,7 +17,7 @@ from rovgraph.live.sources.doppler import report_message
 from rovgraph.live.sources.source import LineDecoder, Notify
 from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
+from rovgraph.log.streams import LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
 from rovgraph.log.units import Scale, near_miss, scales, turn_angles
 from rovgraph.model.config import Config
 from rovgraph.readers.records import Refused, json_number, json_object, shown
@@ -98,7 +98,7 @@ class JsonRow:
                 continue
             elif name == "time" and isinstance(value, str):
                 cells[name] = self._seconds(value)
-            elif name == LABEL and (isinstance(value, str) or json_number(key, value) % 1.0):
+            elif name in labels() and (isinstance(value, str) or json_number(key, value) % 1.0):
                 cells[name] = label_number(str(value))  # 7.5 is a name, as it is in a log
             else:
                 cells[name] = self._scale.get(name, _AS_IT_IS)(json_number(key, value))

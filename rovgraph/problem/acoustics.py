@@ -1,0 +1,479 @@
+"""Acoustic exchanges: from what a system says, and where the ship was, to measurements with a context.
+
+A reply tells of three times: the head asks, the transponder answers a one-way time later, the head hears that. The
+measurement stands where the vehicle answers; the ship's positions and attitudes are interpolated at its own two times:
+at 1000 m a roll of 5 deg/s turns by 6.8 deg between them. Online, a reply waits for the ship's next messages.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
+from rovgraph.kernels import measurement_row as at
+from rovgraph.log import Log, Measurement, Stream
+from rovgraph.log.streams import label_number
+from rovgraph.model.calibration import LAYOUT, USBL_MOUNT
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.sensors.acoustic import AcousticExchange
+from rovgraph.sensors.instruments import Instrument
+from rovgraph.sensors.sensor import LARGEST_SD
+
+SHIP = "ship", "ship_heading", "ship_tilt"  # streams
+UNKNOWN_TILT_SD = math.radians(3.0)  # of a ship without ship_roll and ship_pitch, taken as level
+EDGE_SINE = math.sin(math.radians(5.0))  # nearer to its horizon no planar head measures
+REMEMBERED_S = 600.0  # of the ship's motion, online
+Left = Counter[tuple[str, str]]
+
+
+class Pose(NamedTuple):
+    """The ship at k times: where it is, how it stands, and how that changes.
+
+    Attributes
+    ----------
+    p : its antenna, north and east, shape (k, 2) [m]
+    rpy, rates : shape (k, 3), NaN where nothing tells [rad], [rad/s]
+    v : shape (k, 2) [m/s]
+    """
+
+    p: Array
+    rpy: Array
+    v: Array
+    rates: Array
+
+
+class Track:
+    """Values of a stream of the ship that grows, interpolated."""
+
+    def __init__(self, width: int, angular: bool) -> None:
+        self.width, self.angular = width, angular
+        self.time, self.values = np.empty(0), np.empty((0, width))
+        self.held: Array | None = None
+
+    def hold(self, value: Array) -> None:
+        """Take one value for all times, as a topside on a jetty has it; shape (width,)."""
+        self.held = value
+
+    @property
+    def known(self) -> bool:
+        """Whether anything is known."""
+        return self.held is not None or len(self.time) > 0
+
+    def take(self, time: Array, values: Array) -> None:
+        """Add values in the order of time, or one that is late."""
+        self.time, self.values = np.append(self.time, time), np.vstack([self.values, values[:, : self.width]])
+        if len(self.time) > len(time) and self.time[-len(time)] <= self.time[-len(time) - 1]:
+            order = np.argsort(self.time, kind="stable")
+            self.time, self.values = self.time[order], self.values[order]
+
+    def forget(self, before: float) -> None:
+        """Forget what is older than a time [s]."""
+        kept = max(int(self.time.searchsorted(before)) - 1, 0)
+        self.time, self.values = self.time[kept:], self.values[kept:]
+
+    def at(self, time: Array, longest: float) -> tuple[Array, Array]:
+        """Values and slopes at some times, NaN in silence that is longer than ``longest`` [s], shape (k, width)."""
+        if self.held is not None:
+            return np.tile(self.held, (len(time), 1)), np.zeros((len(time), self.width))
+        if len(self.time) < 2:
+            near = np.abs(time - self.time[0]) <= longest if len(self.time) else np.zeros(len(time), bool)
+            values = np.where(near[:, None], self.values[:1] if len(self.time) else np.nan, np.nan)
+            return values.reshape(len(time), self.width), np.zeros((len(time), self.width))
+        k = self.time.searchsorted(time).clip(1, len(self.time) - 1)
+        step = (self.time[k] - self.time[k - 1])[:, None]
+        change = self.values[k] - self.values[k - 1]
+        slope = (wrap_angle(change) if self.angular else change) / np.maximum(step, 1e-6)
+        since = (time - self.time[k - 1])[:, None]
+        reach = np.maximum(0.0, np.maximum(since - step, -since))  # beyond the ends
+        known = (reach <= longest) & ((step <= longest) | (since <= 0.0) | (since >= step))
+        values = self.values[k - 1] + slope * since
+        return np.where(known, values, np.nan), np.where(known, slope, np.nan)
+
+
+@dataclass(frozen=True)
+class Other:
+    """The other end of exchanges: a beacon by its place in ``beacons``, a receiver by its arm, or the ship."""
+
+    beacon: int = -1
+    arm_s: Array | None = None
+
+
+class Acoustics:
+    """Makes measurements of acoustic exchanges, with what is known of the ship so far.
+
+    Parameters
+    ----------
+    config : effective configuration
+    instruments : the sensors in use
+    """
+
+    def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
+        self.config = config
+        self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, AcousticExchange)}
+        self.tracks = {"ship": Track(2, False), "ship_heading": Track(1, True), "ship_tilt": Track(2, True)}
+        ship = config.ship
+        if ship.north_m is not None and ship.east_m is not None:
+            self.tracks["ship"].hold(np.array([ship.north_m, ship.east_m]))
+        if ship.heading_deg is not None:
+            self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
+        self.waiting: list[Measurement] = []
+        self.since: float | None = None  # time of the first exchange, from which a clock drifts [s]
+        self._places = {label_number(str(beacon.name)): k for k, beacon in enumerate(config.beacons)}
+        self._receivers = {label_number(name): np.array(arm) for name, arm in config.ship.receivers.items()}
+
+    # what comes
+
+    def take_ship(self, streams: Mapping[str, Stream]) -> None:
+        """What a log has of the ship."""
+        for sensor in SHIP:
+            if sensor in streams and len(streams[sensor]):
+                self.tracks[sensor].take(streams[sensor].time, streams[sensor].data)
+
+    def insert(self, m: Measurement, late: float, left_out: Left) -> list[Measurement]:
+        """Take one of the ship's measurements, or an exchange; those that are complete now.
+
+        Parameters
+        ----------
+        late : how late stamps of exchanges are taken to be [s]
+        """
+        if m.sensor in SHIP:
+            self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
+            self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
+        else:
+            self.waiting.append(m)
+        ready, known = [], self._known_until()
+        for one in self.waiting:
+            if not self._needs_ship(one.sensor) or one.time - late <= known:
+                ready.append(one)
+        self.waiting = [one for one in self.waiting if all(one is not other for other in ready)]
+        out = []
+        for one in ready:
+            row = np.array([one.row])
+            stream = self.exchanges(
+                Stream(one.sensor, (), np.array([one.time]), one.values[None], row), late, left_out
+            )
+            out += [Measurement(float(t), one.sensor, v, one.row) for t, v in zip(stream.time, stream.data, strict=True)]
+        return out
+
+    def _known_until(self) -> float:
+        """Up to when all is known of the ship that it has told of so far."""
+        ends = [float(track.time[-1]) for track in self.tracks.values() if len(track.time) and track.held is None]
+        return min(ends, default=math.inf)
+
+    def _needs_ship(self, sensor: str) -> bool:
+        return self.config.usbl.head == "ship" or not self._places if sensor == "usbl" else bool(self._receivers)
+
+    # measurements
+
+    def exchanges(self, stream: Stream, late: float, left_out: Left) -> Stream:
+        """Measurements of exchanges: components, their sds, context and name of the other end, shape (k, 2 D + W + 1).
+
+        Parameters
+        ----------
+        stream : as the log has it, what cannot be left out
+        late : how late the stamps are taken to be [s]
+        left_out : (sensor, reason) -> count, of those that cannot be used
+
+        Raises
+        ------
+        InputError : it is not known which transponder is the vehicle's, or where the ship is
+        """
+        sensor, instrument = stream.sensor, self.instruments[stream.sensor]
+        n, dim = len(stream), instrument.model.dim
+        if self.since is None and n:
+            self.since = float(stream.time[0])
+        why: list[tuple[str, NDArray[np.bool_]]] = []
+        seen = self._direction(stream.data) if sensor == "usbl" else np.zeros((n, 3))
+        length, exact = self._length(stream)
+        names, others = self._others(stream, why)
+        c, settings = self._sound_speed(), self._settings(sensor)
+        way, wait = length / c, settings.turn_around_s
+        heard = stream.time - late
+        context = np.zeros((n, at.WIDTH))
+        assert isinstance(instrument.model, AcousticExchange)
+        context[:, at.ARM : at.ARM + 3] = instrument.model.arm_b
+        context[:, at.SEEN : at.SEEN + 3] = seen
+        context[:, at.STATED], context[:, at.SINCE] = late, stream.time - (self.since or 0.0)
+        context[:, at.WAYS] = 1.0 if settings.one_way else 2.0
+        on_vehicle = sensor == "range" or self.config.usbl.head == "vehicle"
+        if settings.stamp == "transponder":  # when the transponder heard the question, on the ship's or the vehicle's
+            heard = heard + (0.0 if settings.one_way else wait) + way
+        asked = heard - (way if settings.one_way else 2.0 * way + wait)
+        if not on_vehicle:  # the vehicle answers
+            time = heard - way - (0.0 if settings.one_way else 0.5 * wait)
+            context[:, at.WAIT : at.WAIT + 2] = (0.0, 0.0) if settings.one_way else (-0.5 * wait, 0.5 * wait)
+            ends = asked, heard
+        elif sensor == "usbl":  # the vehicle asks, and its attitude counts when it hears
+            time, ends = heard, (heard - way - (0.0 if settings.one_way else wait), heard - way)
+            context[:, at.WAIT] = asked - heard
+        elif settings.one_way:
+            of_ship = np.array([other.arm_s is not None for other in others], bool)
+            time = np.where(of_ship, heard - way, heard)  # the vehicle sends, or a beacon
+            ends = heard, heard
+        else:
+            time, ends = 0.5 * (asked + heard), (asked + way, heard - way)
+            context[:, at.WAIT], context[:, at.WAIT + 1] = asked - time, heard - time
+        sd = self._place_ends(sensor, context, ends, others, why)
+        self._name_variables(sensor, context, others)
+        sds = self._noise(stream, length, exact, seen, sd)
+        z = np.zeros((n, dim))
+        z[:, 0] = length
+        usable = np.ones(n, bool)
+        for reason, bad in why:
+            if (bad & usable).any():
+                left_out[sensor, reason] += int((bad & usable).sum())
+                usable &= ~bad
+        data = np.column_stack([z, sds[:, :dim], context, names])[usable]
+        order = np.argsort(time[usable], kind="stable")
+        return Stream(sensor, (), time[usable][order], data[order], stream.row[usable][order])
+
+    def _settings(self, sensor: str) -> Any:
+        return self.config.usbl if sensor == "usbl" else self.config.range
+
+    def _sound_speed(self) -> float:
+        return self.config.usbl.sound_speed_mps
+
+    def _length(self, stream: Stream) -> tuple[Array, NDArray[np.bool_]]:
+        """One-way length of each [m], 0 where it is unknown; and whether it is known."""
+        settings = self._settings(stream.sensor)
+        length, travel = stream.data[:, 0].copy(), stream.data[:, 1]
+        ways = 1.0 if settings.one_way else 2.0
+        by_time = settings.sound_speed_mps * (travel - (0.0 if settings.one_way else settings.turn_around_s)) / ways
+        length = np.where(np.isnan(length), by_time, length)
+        if stream.sensor == "usbl":
+            length = np.where(np.isnan(length), np.linalg.norm(stream.data[:, 4:7], axis=1), length)
+        known = np.isfinite(length) & (length > 0.0)
+        return np.where(known, length, 0.0), known
+
+    @staticmethod
+    def _direction(values: Array) -> Array:
+        """Unit vectors in the frame that is stated, shape (n, 3)."""
+        bearing, elevation, xyz = values[:, 2], values[:, 3], values[:, 4:7]
+        level = np.cos(elevation)
+        by_angles = np.column_stack([level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)])
+        length = np.linalg.norm(xyz, axis=1, keepdims=True)
+        by_place = xyz / np.where(length > 0.0, length, 1.0)
+        return np.where(np.isnan(by_angles), np.nan_to_num(by_place), by_angles)
+
+    def _others(self, stream: Stream, why: list[tuple[str, NDArray[np.bool_]]]) -> tuple[Array, list[Other]]:
+        """Names of the other ends, and what they are."""
+        if stream.sensor == "usbl":
+            label, receiver = stream.data[:, 7], np.full(len(stream), np.nan)
+        else:
+            label, receiver = stream.data[:, 2], stream.data[:, 3]
+        names = np.nan_to_num(label, nan=0.0)
+        if stream.sensor == "usbl" and self.config.usbl.head == "ship":
+            self._choose_transponder(label, why)
+            return names, [Other()] * len(stream)
+        others, strange = [], np.zeros(len(stream), bool)
+        for k, (beacon, of) in enumerate(zip(label.tolist(), receiver.tolist(), strict=True)):
+            if of in self._receivers:
+                others.append(Other(arm_s=self._receivers[of]))
+                names[k] = of
+            elif math.isnan(beacon) and len(self._places) == 1:
+                others.append(Other(0))
+            elif beacon in self._places:
+                others.append(Other(self._places[beacon]))
+            else:
+                others.append(Other())
+                strange[k] = stream.sensor == "range" or bool(self._places)
+        why.append(("the configuration names no such beacon under beacons", strange))
+        return names, others
+
+    def _choose_transponder(self, label: Array, why: list[tuple[str, NDArray[np.bool_]]]) -> None:
+        """Leave out what belongs to other transponders than the vehicle's."""
+        stated = self.config.usbl.beacon
+        known = np.unique(label[~np.isnan(label)])
+        if stated is not None:
+            why.append(("another transponder than usbl.beacon", ~np.isnan(label) & (label != label_number(str(stated)))))
+        elif len(known) > 1:
+            shown = ", ".join(f"{name:g}" for name in known[:6].tolist())
+            raise InputError(
+                f"usbl: {len(known)} transponders answer ({shown}); state which is the vehicle's: "
+                f"usbl: {{beacon: {known[0]:g}}}"
+            )
+
+    def _place_ends(
+        self,
+        sensor: str,
+        context: Array,
+        ends: tuple[Array, Array],
+        others: Sequence[Other],
+        why: list[tuple[str, NDArray[np.bool_]]],
+    ) -> Array:
+        """Write where the other ends were into contexts; sds that this adds: place [m], heading, tilt [rad]."""
+        n, usbl = len(context), self.config.usbl
+        sd = np.zeros((n, 3))
+        on_ship = np.array([other.beacon < 0 for other in others], bool)
+        context[:, at.FRAME : at.FRAME + 9] = np.eye(3).ravel()
+        context[:, at.INVERTED] = float(sensor == "usbl" and usbl.head == "vehicle")
+        if not on_ship.any():
+            return sd
+        of_head = usbl.lever_arm_m if usbl.head == "ship" else usbl.beacon_arm_m
+        arms = np.array([np.array(of_head) if other.arm_s is None else other.arm_s for other in others])
+        frame = usbl.frame if sensor == "usbl" and usbl.head == "ship" else "ship"
+        heading = frame != "north" or bool(np.any(arms[:, :2]) or np.any(self.config.ship.antenna_m[:2]))
+        asked, heard = (self._pose(time) for time in ends)
+        for part, pose in ((at.ASKED, asked), (at.HEARD, heard)):
+            R_ns = matrix_from_rpy(np.nan_to_num(pose.rpy))
+            place = np.column_stack([pose.p, np.zeros(n)])
+            antenna = rotate(R_ns, np.broadcast_to(np.array(self.config.ship.antenna_m), (n, 3)))
+            antenna[:, 2] = 0.0  # heights count from the waterline
+            context[:, part : part + 3] = place - antenna + rotate(R_ns, arms)
+            why.append(("without a position of the ship", on_ship & np.isnan(pose.p).any(axis=1)))
+            if heading:
+                why.append(("without a heading of the ship", on_ship & np.isnan(pose.rpy[:, 2])))
+        rpy, rates = np.nan_to_num(heard.rpy), np.nan_to_num(heard.rates)
+        velocity = np.column_stack([np.nan_to_num(heard.v), np.zeros(n)])
+        R_ns = matrix_from_rpy(rpy)
+        turn = _turn_rate(rpy, rates)
+        velocity += rotate(R_ns, np.cross(turn, arms - np.array(self.config.ship.antenna_m)))
+        context[:, at.MOVES : at.MOVES + 3] = velocity
+        if frame == "transducer":
+            context[:, at.FRAME : at.FRAME + 9] = R_ns.reshape(n, 9)
+            context[:, at.TURNS : at.TURNS + 3] = turn
+        elif frame == "ship":
+            level = np.column_stack([np.zeros((n, 2)), rpy[:, 2]])
+            context[:, at.FRAME : at.FRAME + 9] = matrix_from_rpy(level).reshape(n, 9)
+            context[:, at.TURNS + 2] = rates[:, 2]
+        for part in (at.ASKED, at.HEARD, at.MOVES, at.TURNS):
+            context[~on_ship, part : part + 3] = 0.0
+        ship = self.config.ship
+        tilted = self.tracks["ship_tilt"].known
+        sd[:] = (
+            ship.sd_m,
+            math.radians(ship.heading_sd_deg),
+            math.radians(ship.tilt_sd_deg) if tilted or frame != "transducer" else UNKNOWN_TILT_SD,
+        )
+        return sd * on_ship[:, None]
+
+    def _pose(self, time: Array) -> Pose:
+        """The ship at some times."""
+        longest, n = self.config.ship.max_gap_s, len(time)
+        found = {sensor: track.at(time, longest) for sensor, track in self.tracks.items()}
+        rpy = np.column_stack([found["ship_tilt"][0], found["ship_heading"][0]])
+        rates = np.column_stack([found["ship_tilt"][1], found["ship_heading"][1]])
+        if not self.tracks["ship_tilt"].known:
+            rpy[:, :2] = rates[:, :2] = np.zeros((n, 2))
+        return Pose(found["ship"][0], rpy, found["ship"][1], rates)
+
+    def _name_variables(self, sensor: str, context: Array, others: Sequence[Other]) -> None:
+        """Write where the calibration variables are into contexts."""
+        known = self.instruments[sensor].calibration
+        lasting = ("usbl_direction_error", "usbl_range_error") if sensor == "usbl" else ("", "range_error")
+        names = (
+            USBL_MOUNT[0] if sensor == "usbl" else "",
+            "usbl_arm" if sensor == "usbl" else "",
+            "",
+            "",
+            "sound_speed_scale",
+            f"{sensor}_range_offset" if sensor == "usbl" else "range_offset",
+            "range_clock",
+            "range_clock_drift",
+            *lasting,
+            f"{sensor}_time_offset",
+        )
+        context[:, at.MOUNT_AT : at.WIDTH] = [LAYOUT[name].start if name in known else -1 for name in names]
+        for k, other in enumerate(others):
+            if other.beacon >= 0:
+                name = f"beacon_{other.beacon + 1}"
+                context[k, at.BEACON_AT], context[k, at.DOWN_AT] = LAYOUT[name].start, LAYOUT[f"{name}_down"].start
+
+    def _noise(self, stream: Stream, length: Array, known: NDArray[np.bool_], seen: Array, ship: Array) -> Array:
+        """Sds of range, across and up, shape (n, 3), with what the ship's place and attitude add to them."""
+        place, heading, tilt = ship.T
+        believed = self.instruments[stream.sensor].sd
+        own = stream.data[:, 8 if stream.sensor == "usbl" else 4]
+        along = np.where(own > 0.0, own, believed[0])
+        out = np.empty((len(stream), 3))
+        out[:, 0] = np.where(known, np.hypot(along, place), LARGEST_SD)
+        if stream.sensor != "usbl":
+            return out
+        own = stream.data[:, 9]
+        angle = np.where(own > 0.0, own, believed[1])
+        down = np.abs(seen[:, 2] if self.config.usbl.head == "ship" else 1.0)
+        level = np.sqrt(np.maximum(1.0 - seen[:, 2] ** 2, 0.0))
+        up = angle / np.maximum(down, EDGE_SINE) if self.config.usbl.planar else angle
+        moved = place / np.maximum(length, 1.0)
+        out[:, 1] = np.sqrt(angle**2 + moved**2 + (heading * level) ** 2 + tilt**2)
+        out[:, 2] = np.sqrt(up**2 + moved**2 + tilt**2)
+        return np.minimum(out, LARGEST_SD)
+
+    # files and twins
+
+    def copy(self) -> "Acoustics":
+        """One that goes on by itself from here."""
+        twin = copy(self)
+        twin.tracks, twin.waiting = {sensor: copy(track) for sensor, track in self.tracks.items()}, self.waiting[:]
+        return twin
+
+    def state(self) -> dict[str, Any]:
+        """What is known of the ship, as plain values."""
+        return {
+            "since": math.nan if self.since is None else self.since,
+            **{f"{sensor}_time": track.time for sensor, track in self.tracks.items()},
+            **{f"{sensor}_values": track.values for sensor, track in self.tracks.items()},
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood."""
+        since = float(state["since"])
+        self.since = None if math.isnan(since) else since
+        for sensor, track in self.tracks.items():
+            track.time = np.array(state[f"{sensor}_time"], float)
+            track.values = np.array(state[f"{sensor}_values"], float).reshape(-1, track.width)
+
+
+def _turn_rate(rpy: Array, rates: Array) -> Array:
+    """Angular rate in the ship's axes of rates of roll, pitch and yaw, shape (n, 3) [rad/s]."""
+    sr, cr = np.sin(rpy[:, 0]), np.cos(rpy[:, 0])
+    sp, cp = np.sin(rpy[:, 1]), np.cos(rpy[:, 1])
+    roll, pitch, yaw = rates.T
+    return np.column_stack([roll - yaw * sp, pitch * cr + yaw * sr * cp, yaw * cr * cp - pitch * sr])
+
+
+def rough_positions(log: Log, config: Config, instruments: Mapping[str, Instrument]) -> Stream | None:
+    """Where acoustic directions and ranges put the vehicle by themselves: north, east, down and sd [m].
+
+    Of a head on the ship, by its nominal mounting; to begin with, to search with and to draw.
+    """
+    if "usbl" not in log or config.usbl.head != "ship" or "usbl" not in instruments:
+        return None
+    acoustics = Acoustics(config, instruments)
+    acoustics.take_ship(log.streams)
+    stream = acoustics.exchanges(log["usbl"], 0.0, Counter())
+    z, sd, x = stream.data[:, :3], stream.data[:, 3:6], stream.data[:, 6 : 6 + at.WIDTH]
+    R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
+    p = x[:, at.HEARD : at.HEARD + 3] + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
+    across = z[:, 0] * np.max(sd[:, 1:], axis=1)
+    columns = "fix_north", "fix_east", "down", "fix_sd"
+    return Stream("usbl", columns, stream.time, np.column_stack([p, np.hypot(across, sd[:, 0])]), stream.row)
+
+
+
+
+def unusable_acoustics(config: Config, sensors: Collection[str]) -> dict[str, str]:
+    """Acoustic streams that cannot be used, with what is missing, of a log that has some streams."""
+    ship = config.ship
+    placed = "ship" in sensors or (ship.north_m is not None and ship.east_m is not None)
+    headed = "ship_heading" in sensors or ship.heading_deg is not None
+    arms = any((*config.usbl.lever_arm_m[:2], *ship.antenna_m[:2]))
+    out = {}
+    if "usbl" in sensors and (config.usbl.head == "ship" or not config.beacons):
+        if not placed:
+            out["usbl"] = "where the ship is is not known; give ship_lat and ship_lon, or ship.north_m and ship.east_m"
+        elif not headed and (config.usbl.frame != "north" or arms):
+            out["usbl"] = "the ship's heading is not known; give ship_heading, or usbl: {frame: north} if it is so"
+    if "range" in sensors:
+        if not config.beacons and not ship.receivers:
+            out["range"] = "state beacons: [{name: ...}], with a place where it is known, or ship.receivers"
+        elif not config.beacons and not (placed and headed):
+            out["range"] = "where the ship is and heads is not known; give ship_lat, ship_lon and ship_heading"
+    return out

@@ -1,0 +1,173 @@
+"""Acoustic positioning: directions and ranges of a head (USBL), ranges to beacons, and the ship that carries them.
+
+An exchange of sound is one equation (`rovgraph.kernels.measurements`); its numbers come with each measurement: where
+the other end was, and the direction that was measured. `rovgraph.problem.acoustics` puts them together.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurements as kernels
+from rovgraph.kernels.measurement_row import WIDTH
+from rovgraph.model.calibration import USBL_MOUNT
+from rovgraph.model.config import Config
+from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instrument
+
+FARTHEST_M = 12e3  # that the sound of a positioning system reaches
+SLOWEST_MPS = 1400.0  # sound in water
+MOST_ELEVATION = 0.5 * np.pi + 1e-6
+
+
+@dataclass(frozen=True)
+class AcousticExchange:
+    """Range, and direction where a head measures it.
+
+    Attributes
+    ----------
+    sensor : "usbl" or "range"
+    dim : 3 = range [m], and across and up from the direction that was measured [rad]; 1 = range
+    arm_b : ndarray, shape (3,), of the point on the vehicle, relative to the state's origin [m]
+    calibration : variables that it depends on, those of the beacons in use among them
+    context : ndarray, shape (n, WIDTH), of each measurement, `rovgraph.kernels.measurement_row`
+    """
+
+    sensor: str
+    dim: int
+    arm_b: Array
+    calibration: tuple[str, ...]
+    context: Array = field(default_factory=lambda: np.zeros((1, WIDTH)))
+    angular = False
+    state = (POSE, VELOCITY, BIAS)
+    kind = kernels.ACOUSTIC
+
+    @property
+    def packed(self) -> Array:
+        """The contexts."""
+        return self.context
+
+    def of(self, context: Array) -> "AcousticExchange":
+        """The model of measurements with these contexts, shape (n, WIDTH)."""
+        return replace(self, context=np.ascontiguousarray(context))
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE, VELOCITY), state, rate_b)
+
+
+def beacon_variables(config: Config) -> tuple[str, ...]:
+    """Calibration variables of the places of the beacons that a configuration names."""
+    names = (f"beacon_{k + 1}" for k in range(len(config.beacons)))
+    return tuple(variable for name in names for variable in (name, f"{name}_down"))
+
+
+def positioning_head(config: Config, origin_b: Array) -> Instrument:
+    """Range and direction of an acoustic head, on the ship or on the vehicle."""
+    usbl = config.usbl
+    inverted = usbl.head == "vehicle"
+    of_head = *USBL_MOUNT, "usbl_arm", "sound_speed_scale", "usbl_range_offset"
+    lasting = "usbl_direction_error", "usbl_range_error"
+    variables = *of_head, *lasting, *(beacon_variables(config) if inverted else ()), "usbl_time_offset"
+    arm = np.array(usbl.lever_arm_m if inverted else usbl.beacon_arm_m) - origin_b
+    angle = float(np.deg2rad(usbl.angle_sd_deg))
+    sd, components = (usbl.range_sd_m, angle, angle), ("range", "across", "up")
+    model = AcousticExchange("usbl", 3, arm, variables)
+    return instrument(usbl, model, sd, components, time_offset="usbl_time_offset")
+
+
+def ranging(config: Config, origin_b: Array) -> Instrument:
+    """Ranges to beacons, or to receivers on the ship."""
+    clock = ("range_clock", "range_clock_drift") if config.range.one_way else ("range_offset",)
+    variables = "sound_speed_scale", *clock, "range_error", *beacon_variables(config), "range_time_offset"
+    model = AcousticExchange("range", 1, np.array(config.range.lever_arm_m) - origin_b, variables)
+    return instrument(config.range, model, config.range.sd_m, ("range",), time_offset="range_time_offset")
+
+
+Masks = Iterator[tuple[str, NDArray[np.bool_]]]
+
+
+def _impossible(length: int, time: int) -> Callable[[Array, Config], Masks]:
+    """What is no way of sound, by the columns of range and travel time."""
+
+    def refused(values: Array, config: Config) -> Masks:
+        r, t = values[:, length], values[:, time]
+        yield "range of 0 or less", (r <= 0.0) | (t <= 0.0)
+        yield "farther than sound reaches", (r > FARTHEST_M) | (t > 2.0 * FARTHEST_M / SLOWEST_MPS)
+
+    return refused
+
+
+def _impossible_direction(values: Array, config: Config) -> Masks:
+    yield from _impossible(0, 1)(values, config)
+    yield "elevation beyond 90 degrees", np.abs(values[:, 3]) > MOST_ELEVATION
+
+
+def _is_reply(values: Array) -> NDArray[np.bool_]:
+    """Rows of `USBL` that have a direction, and a range or travel time."""
+    known = ~np.isnan(values)
+    direction = known[:, 2] & known[:, 3] & (known[:, 0] | known[:, 1])
+    return np.asarray(direction | known[:, 4:7].all(axis=1))
+
+
+def _is_range(values: Array) -> NDArray[np.bool_]:
+    return np.asarray(~np.isnan(values[:, :2]).all(axis=1))
+
+
+USBL = Sensor(
+    "usbl",
+    (
+        Column("usbl_range", "length", optional=True),
+        Column("usbl_travel_time", optional=True),
+        Column("usbl_bearing", "angle", optional=True, group="usbl_direction"),
+        Column("usbl_elevation", "angle", optional=True, group="usbl_direction"),
+        *(Column(f"usbl_{axis}", "length", optional=True) for axis in "xyz"),
+        Column("usbl_beacon", optional=True, label=True),
+        Column("usbl_range_sd", "length", optional=True, largest=1e3),
+        Column("usbl_angle_sd", "angle", optional=True, group="usbl_direction", largest=1.6),
+    ),
+    positioning_head,
+    refused=_impossible_direction,
+    observes=Observed("position"),
+    may_begin_later=True,
+    occasional=True,
+    complete=_is_reply,
+)
+RANGE = Sensor(
+    "range",
+    (
+        Column("range", "length", optional=True),
+        Column("travel_time", optional=True),
+        Column("range_beacon", optional=True, label=True),
+        Column("range_receiver", optional=True, label=True),
+        Column("range_sd", "length", optional=True, largest=1e3),
+    ),
+    ranging,
+    refused=_impossible(0, 1),
+    observes=Observed("position"),
+    may_begin_later=True,
+    occasional=True,
+    complete=_is_range,
+)
+SHIP = Sensor(
+    "ship",
+    (
+        Column("ship_north", "length"),
+        Column("ship_east", "length"),
+        Column("ship_sd", "length", optional=True, largest=5e3),
+    ),
+    may_begin_later=True,
+    occasional=True,
+)
+SHIP_HEADING = Sensor(
+    "ship_heading", (Column("ship_heading", "angle"),), may_begin_later=True, usual_rates=(0.2, 1000.0)
+)
+SHIP_TILT = Sensor(
+    "ship_tilt",
+    (Column("ship_roll", "angle"), Column("ship_pitch", "angle")),
+    may_begin_later=True,
+    usual_rates=(0.2, 1000.0),
+)
