@@ -18,6 +18,7 @@ from rovgraph.diagnosis import (
     verdict_of,
 )
 from rovgraph.diagnosis.check import Finding
+from rovgraph.diagnosis.acoustics import BeaconPlaces, find_beacons, find_latency
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.inference.chain_optimum import ChainOptimum
@@ -115,6 +116,7 @@ def smooth(
     log, frozen = without_frozen(log, config)
     log, gaps = without_attitude_gaps(log, config)
     solver = _Solver(log, initialise(log, config), frozen, gaps, findings, estimate, progress)
+    solver.look_ahead()
     solver.solve()
     for search in (find_noise, find_errors) if config.graph.find_noise else ():
         if solver.learns_by(search):
@@ -131,6 +133,7 @@ class _Solver:
     log, frozen, gaps, findings, estimate, progress : the dive, and what is asked for
     initial : how it begins, with what is believed
     found, rivals : what was revealed, and what would explain it as clearly
+    beacons : where those may be whose places nobody stated
     before : the track that was smoothed before
     estimates, left_out, statistics : of the newest solution
     best : the optimum of its smoothed estimate, where a batch solver found it
@@ -145,11 +148,23 @@ class _Solver:
     progress: Progress
     found: tuple[UnstatedNoise, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    beacons: list[BeaconPlaces] = field(default_factory=list)
     before: Trajectory | None = None
     estimates: list[Estimate] = field(default_factory=list)
     left_out: dict[tuple[str, str], int] = field(default_factory=dict)
     statistics: list[Statistic] = field(default_factory=list)
     best: Optimum | None = None
+
+    def look_ahead(self) -> None:
+        """Believe what dead reckoning shows of an acoustic system, before the dive is solved."""
+        if "usbl" in self.initial.instruments and self.initial.config.graph.find_noise:
+            found = find_latency(self.log, assemble(self.log, self.initial).problem, self.initial)
+            if found is not None:
+                self.initial, self.found = self.initial.believing(found.beliefs), (found,)
+        if "range" in self.initial.instruments:
+            self.beacons = find_beacons(self.log, assemble(self.log, self.initial).problem, self.initial)
+            for beacon in self.beacons:
+                self.initial = self.initial.believing(beacon.beliefs(self.initial, beacon.best))
 
     def solve(self) -> None:
         """Estimate the dive as it is believed to be, from where the last optimum stands."""

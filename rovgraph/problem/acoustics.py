@@ -231,8 +231,9 @@ class Acoustics:
                 left_out[sensor, reason] += int((bad & usable).sum())
                 usable &= ~bad
         data = np.column_stack([z, sds[:, :dim], context, names])[usable]
-        order = np.argsort(time[usable], kind="stable")
-        return Stream(sensor, (), time[usable][order], data[order], stream.row[usable][order])
+        time = time[usable] + late  # the assembly puts them earlier
+        order = np.argsort(time, kind="stable")
+        return Stream(sensor, (), time[order], data[order], stream.row[usable][order])
 
     def _settings(self, sensor: str) -> Any:
         return self.config.usbl if sensor == "usbl" else self.config.range

@@ -1,0 +1,254 @@
+"""What an acoustic system hides, found beside dead reckoning before the dive is solved: late stamps, unknown beacons.
+
+Stamps: each lag puts ship and vehicle elsewhere. For each the replies are compared with dead reckoning, robustly, with
+what is linear fitted: the head's mounting, and where dead reckoning begins, how it turns, stretches and drifts.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.diagnosis.unstated_noise import UnstatedNoise
+from rovgraph.geometry import Array, exp_rotation, log_rotation
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.kernels import measurement_row as at
+from rovgraph.log import Log, Stream
+from rovgraph.model.calibration import LAYOUT, USBL_MOUNT
+from rovgraph.model.state import POSE, State
+from rovgraph.problem.acoustics import Acoustics
+from rovgraph.problem.initial_conditions import Beliefs, InitialConditions
+from rovgraph.problem.problem import Problem
+from rovgraph.sensors import AcousticExchange
+
+LATENCY = "usbl_time_offset"
+EARLIEST_S, LATEST_S, STEP_S = -1.0, 5.0, 0.1  # lags that are tried; systems are up to 3 s late
+ENOUGH = 20  # replies
+MOST = 1500  # of them that are compared, evenly
+CLEARER = 30.0  # gain of the robust cost that a lag must bring
+LEAST_S, LEAST_SD_S = 0.04, 0.1  # lags below stay in the noise; sd of the prior that a found one gets
+TUKEY = 3.0  # sds at which a reply begins to count less
+PASSES = 6  # of reweighting
+
+
+def find_latency(log: Log, problem: Problem, initial: InitialConditions) -> UnstatedNoise | None:
+    """How late the stamps of acoustic positions are, where no one states it and the dive shows it.
+
+    Parameters
+    ----------
+    log, problem, initial : the dive, assembled as it is believed to be
+    """
+    belief = initial.beliefs[LATENCY]
+    if "usbl" not in initial.instruments or "usbl" not in log or belief.estimate or not {"dvl", "dvl_water"} & log.sensors:
+        return None
+    states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
+    replies = log["usbl"]
+    if len(replies) > MOST:
+        replies = replies.take(np.unique(np.linspace(0, len(replies) - 1, MOST).astype(int)))
+    search = _LagSearch(log, replies, problem.time, states, initial)
+    lags = float(belief.mean[0]) + np.arange(EARLIEST_S, LATEST_S + STEP_S / 2, STEP_S)
+    cost = np.array([search.cost(lag) for lag in lags])
+    if not np.isfinite(cost).any():
+        return None
+    k = int(np.nanargmin(cost))
+    fine = lags[k] + np.arange(-STEP_S, 1.01 * STEP_S, STEP_S / 5)
+    costs = np.array([search.cost(lag) for lag in fine])
+    j = int(np.clip(np.nanargmin(costs), 1, len(fine) - 2))
+    bend = costs[j + 1] - 2.0 * costs[j] + costs[j - 1]
+    lag = float(fine[j] - 0.5 * STEP_S / 5 * (costs[j + 1] - costs[j - 1]) / bend) if bend > 0.0 else float(fine[j])
+    sd = float(STEP_S / 5 / np.sqrt(bend)) if bend > 0.0 else STEP_S
+    as_stated = search.cost(float(belief.mean[0]))
+    off = lag - float(belief.mean[0])
+    if abs(off) < max(LEAST_S, 3.0 * sd) or not as_stated - costs[j] > CLEARER:
+        return None
+    sd = max(LEAST_SD_S, 3.0 * sd)
+    values = {"estimate": True, "mean": round(lag, 2), "sd": round(sd, 2)}
+    found = replace(belief, mean=np.array([lag]), sd=sd, estimate=True)
+    return UnstatedNoise(
+        "usbl",
+        f"calibration.{LATENCY}",
+        values,
+        f"its stamps are {lag:.2f} s late beside the vehicle's own motion and the ship's",
+        "it is estimated from there",
+        Beliefs({LATENCY: found}),
+    )
+
+
+class _LagSearch:
+    """Replies beside dead reckoning, at lags."""
+
+    def __init__(self, log: Log, replies: Stream, time: Array, states: State, initial: InitialConditions) -> None:
+        self.log, self.replies, self.time, self.states, self.initial = log, replies, time, states, initial
+        self.acoustics = Acoustics(initial.config, initial.instruments)
+        self.acoustics.take_ship(log.streams)
+        self.calibration = {name: b.mean for name, b in initial.beliefs.items()}
+
+    def cost(self, lag: float) -> float:
+        """Robust cost of the replies with a lag; infinite where too few can be compared."""
+        stream = self.acoustics.exchanges(self.replies, lag, Counter())
+        stream = replace(stream, time=stream.time - lag)
+        inside = (stream.time > self.time[0]) & (stream.time < self.time[-1])
+        stream = stream.take(inside)
+        if len(stream) < ENOUGH:
+            return np.inf
+        r, H = self._linearized(stream, lag)
+        x, weight = np.zeros(H.shape[2]), np.ones(len(r))
+        for _ in range(PASSES):
+            root = np.sqrt(weight)[:, None]
+            A, b = (H * root[..., None]).reshape(-1, H.shape[2]), (r * root).ravel()
+            x = np.linalg.lstsq(A, b, rcond=None)[0]
+            d2 = np.sum((r - H @ x) ** 2, axis=1)
+            weight = 1.0 / (1.0 + d2 / TUKEY**2)
+        return float(0.5 * TUKEY**2 * np.sum(np.log1p(d2 / TUKEY**2)) * len(self.replies) / len(stream))
+
+    def _linearized(self, stream: Stream, lag: float) -> tuple[Array, Array]:
+        """Whitened innovations, shape (n, 3), and Jacobians by what is fitted, shape (n, 3, 11)."""
+        model = self.initial.instruments["usbl"].model
+        assert isinstance(model, AcousticExchange)
+        z, sd, context = np.split(stream.data[:, : 6 + at.WIDTH], [3, 6], axis=1)
+        state = _interpolated(self.states, self.time, stream.time, {**self.calibration, LATENCY: np.array([lag])})
+        predicted, H = model.of(context).predict(state, np.zeros((len(z), 3)))
+        by_place = H[POSE][..., 3:] @ np.swapaxes(state.R_nb, 1, 2)  # along north, east, down
+        p = state.p_n - self.states.p_n[0]
+        turned = np.stack([-p[:, 1], p[:, 0], np.zeros(len(p))], axis=1)
+        level = p * [1.0, 1.0, 0.0]
+        share = ((stream.time - self.time[0]) / (self.time[-1] - self.time[0]))[:, None, None]
+        columns = [
+            *(H[name] * np.deg2rad(10.0) for name in USBL_MOUNT),
+            by_place * 5.0,
+            (by_place @ turned[..., None]) * 0.1,
+            (by_place @ level[..., None]) * 0.1,
+            by_place[..., :2] * share * 5.0,
+            H["sound_speed_scale"] * 0.01,
+        ]
+        return (z - predicted) / sd, np.concatenate(columns, axis=2) / sd[..., None]
+
+
+def _interpolated(states: State, time: Array, wanted: Array, calibration: Mapping[str, Array]) -> State:
+    """States between keyframes: attitude by the turn between two, position and velocity along a line."""
+    k = time.searchsorted(wanted).clip(1, len(time) - 1)
+    share = ((wanted - time[k - 1]) / (time[k] - time[k - 1]))[:, None]
+    turn = log_rotation(np.swapaxes(states.R_nb[k - 1], 1, 2) @ states.R_nb[k])
+    R = states.R_nb[k - 1] @ exp_rotation(share * turn)
+    p, v = ((1.0 - share) * a[k - 1] + share * a[k] for a in (states.p_n, states.v_n))
+    return State(R, p, v, states.bias[k], calibration)
+
+
+FEWEST = 6  # ranges to a beacon whose place is unknown
+STARTS = 24  # of the search for a beacon, around the track
+DRIFT = 0.02  # of dead reckoning, part of the distance
+SAME_M = 3.0  # places that near are one
+RUNNER_UP = 12.0  # cost that a mirrored place may have beyond the best for both to be kept
+DOWN_SD = 20.0  # of a beacon of which nothing shows the depth [m]
+
+
+@dataclass(frozen=True)
+class BeaconPlaces:
+    """Where a beacon whose place nobody stated may be.
+
+    Attributes
+    ----------
+    name, variable : as the configuration and the calibration name it
+    best, other : ndarray, shape (3,), north, east, down; ``other`` is a mirrored place that explains as much, or None
+    down_sd : of its depth to begin with [m]
+    """
+
+    name: str
+    variable: str
+    best: Array
+    other: Array | None
+    down_sd: float
+
+    def beliefs(self, initial: InitialConditions, place: Array) -> Beliefs:
+        """The beacon at a place, as vaguely known as before."""
+        down = f"{self.variable}_down"
+        found = {self.variable: replace(initial.beliefs[self.variable], mean=place[:2].copy())}
+        if self.down_sd:
+            found[down] = replace(initial.beliefs[down], mean=place[2:].copy(), sd=self.down_sd)
+        return Beliefs(found)
+
+
+def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list[BeaconPlaces]:
+    """Places of beacons that the configuration names without one, by ranges along dead reckoning.
+
+    Raises
+    ------
+    InputError : too few ranges to one of them
+    """
+    out = []
+    for k, beacon in enumerate(initial.config.beacons):
+        if beacon.north_m is not None or "range" not in initial.instruments:
+            continue
+        variable = f"beacon_{k + 1}"
+        rows = problem.of_sensor("range")
+        rows = rows[problem.contexts(rows)[:, at.BEACON_AT] == LAYOUT[variable].start]
+        if len(rows) < FEWEST:
+            raise InputError(
+                f"{log.source}: {len(rows)} ranges to beacon {beacon.name}, whose place is unknown; {FEWEST} are needed: "
+                f"state beacons: [{{name: {beacon.name}, north_m: .., east_m: ..}}], or leave it out"
+            )
+        states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
+        there = _interpolated(states, problem.time, problem.rows[rows, at.TIME], {})
+        gone = np.linalg.norm(np.diff(states.p_n, axis=0), axis=1)
+        way = np.interp(problem.rows[rows, at.TIME], problem.time, np.append(0.0, np.cumsum(gone)))
+        sd = np.hypot(problem.sd(rows, 1)[:, 0], DRIFT * way)
+        down, down_sd = _depth_of_bottom(log, beacon.down_m, there.p_n)
+        places = _trilaterate(there.p_n, problem.z(rows, 1)[:, 0], sd, down, down_sd or beacon.down_sd_m)
+        other = next((p for p, cost in places[1:] if cost - places[0][1] < RUNNER_UP), None)
+        out.append(BeaconPlaces(str(beacon.name), variable, places[0][0], other, down_sd))
+    return out
+
+
+def _depth_of_bottom(log: Log, stated: float | None, p_n: Array) -> tuple[float, float]:
+    """Depth of a beacon to begin with and its sd, 0 where it is stated [m]."""
+    if stated is not None:
+        return stated, 0.0
+    if "dvl_altitude" in log:
+        altitude = log["dvl_altitude"]
+        bottom = np.median(p_n[:, 2]) + np.median(altitude.data[:, 0])
+        return float(bottom), 5.0
+    return float(p_n[:, 2].max()), DOWN_SD
+
+
+def _trilaterate(p_n: Array, length: Array, sd: Array, down: float, down_sd: float) -> list[tuple[Array, float]]:
+    """Places with the robust cost of ranges from n points, the best first, each once."""
+    middle, radius = p_n.mean(axis=0), float(np.median(length))
+    found: list[tuple[Array, float]] = []
+    for angle in np.linspace(0.0, 2.0 * np.pi, STARTS, endpoint=False):
+        place = np.array([middle[0] + radius * np.cos(angle), middle[1] + radius * np.sin(angle), down])
+        place, cost = _descend(place, p_n, length, sd, down, down_sd)
+        if all(np.linalg.norm(place[:2] - p[:2]) > SAME_M for p, _ in found):
+            found.append((place, cost))
+    return sorted(found, key=lambda one: one[1])
+
+
+def _descend(place: Array, p_n: Array, length: Array, sd: Array, down: float, down_sd: float) -> tuple[Array, float]:
+    """Levenberg's method with Cauchy's loss."""
+
+    def rated(at_place: Array) -> tuple[Array, Array, float]:
+        away = at_place - p_n
+        d = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
+        r = (length - d) / sd
+        cost = 0.5 * TUKEY**2 * float(np.sum(np.log1p((r / TUKEY) ** 2)))
+        return r, away / (d * sd)[:, None], cost + 0.5 * float((at_place[2] - down) / down_sd) ** 2
+
+    r, J, cost = rated(place)
+    damping = 1e-3
+    for _ in range(60):
+        weight = 1.0 / (1.0 + (r / TUKEY) ** 2)
+        N = (J * weight[:, None]).T @ J + np.diag([0.0, 0.0, down_sd**-2])
+        g = (J * weight[:, None]).T @ r - np.array([0.0, 0.0, (place[2] - down) / down_sd**2])
+        step = np.linalg.solve(N + damping * np.diag(np.diag(N) + 1e-9), g)
+        new = rated(place + step)
+        if new[2] < cost:
+            small = np.linalg.norm(step) < 1e-3
+            place, (r, J, cost), damping = place + step, new, damping / 5.0
+            if small:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e9:
+                break
+    return place, cost
