@@ -17,9 +17,10 @@ from rovgraph.diagnosis import (
     statistics,
     verdict_of,
 )
+from rovgraph.diagnosis.acoustics import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons, find_latency
 from rovgraph.diagnosis.check import Finding
-from rovgraph.diagnosis.acoustics import BeaconPlaces, find_beacons, find_latency
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
+from rovgraph.geometry import Array
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import Rival
@@ -134,6 +135,7 @@ class _Solver:
     initial : how it begins, with what is believed
     found, rivals : what was revealed, and what would explain it as clearly
     beacons : where those may be whose places nobody stated
+    mirrors : second places of these that the dive does not exclude
     before : the track that was smoothed before
     estimates, left_out, statistics : of the newest solution
     best : the optimum of its smoothed estimate, where a batch solver found it
@@ -149,6 +151,7 @@ class _Solver:
     found: tuple[UnstatedNoise, ...] = ()
     rivals: tuple[Rival, ...] = ()
     beacons: list[BeaconPlaces] = field(default_factory=list)
+    mirrors: list[MirroredBeacon] = field(default_factory=list)
     before: Trajectory | None = None
     estimates: list[Estimate] = field(default_factory=list)
     left_out: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -165,6 +168,7 @@ class _Solver:
             self.beacons = find_beacons(self.log, assemble(self.log, self.initial).problem, self.initial)
             for beacon in self.beacons:
                 self.initial = self.initial.believing(beacon.beliefs(self.initial, beacon.best))
+                self.initial.assumptions.append(beacon.text)
 
     def solve(self) -> None:
         """Estimate the dive as it is believed to be, from where the last optimum stands."""
@@ -184,21 +188,48 @@ class _Solver:
             if self.estimate != "smoothed":
                 filtered, passed = _filtered(batch, self.progress)
                 self.estimates, states = [filtered], passed if states is None else states
-            batch = batch.without_covariances()
+            if not self.beacons:
+                batch = batch.without_covariances()
             if self.estimate != "filtered":
                 self.progress("smoothing", 0.5)
                 self.best = batch.optimum(states)
+                moved = self._mirrored(batch)
+                if moved is not batch and self.estimates:
+                    self.estimates = [_filtered(moved, self.progress)[0]]
+                batch = moved
                 self.estimates.insert(0, smoothed(self.best, self.initial))
         self._judge(batch)
+
+    def _mirrored(self, batch: BatchSmoother) -> BatchSmoother:
+        """Solve the dive with the other place of beacons that may lie on either side of it; keep the likelier one."""
+        self.mirrors = []
+        for beacon in self.beacons:
+            if beacon.other is None or not isinstance(self.best, ChainOptimum):
+                continue
+            initial = self.initial.believing(beacon.beliefs(self.initial, beacon.other))
+            other = replace(batch, initial=initial).optimum()
+            if other.solution.cost < self.best.solution.cost:
+                self.best, other, self.initial = other, self.best, initial
+                batch = replace(batch, initial=initial)
+            places = [np.reshape(one.state.calibration[beacon.variable], (-1, 2))[-1] for one in (self.best, other)]
+            margin, apart = other.solution.cost - self.best.solution.cost, places[0] - places[1]
+            if np.linalg.norm(apart) > SAME_M:
+                mirror = MirroredBeacon(beacon.name, beacon.variable, places[1], apart, margin, other.state.p_n)
+                self.mirrors += [mirror] if mirror.ambiguous else []
+        return batch
 
     def _judge(self, batch: BatchSmoother) -> None:
         """Figures of the verdict; sds cover where rivals put the track."""
         self.left_out, best = _left_out(batch, self.frozen, self.gaps), self.best
         revealed = [(one.sensor, one.cause) for one in reversed(self.found)]  # first what moves the track most
         seen = self.frozen, self.log, self.gaps, self.left_out, self.findings, revealed, self.before, self.rivals
+        seen = *seen, [("range", mirror.cause, mirror.margin) for mirror in self.mirrors]
         self.statistics = statistics(Evidence(self.initial, self.estimates, (best or batch).problem, best, *seen))
         if best is not None and any(one.kind == "rivals" and one.severity for one in self.statistics):
-            self.estimates = [_covering(estimate, self.rivals, best) for estimate in self.estimates]
+            self.estimates = [_covering(estimate, [r.p_n for r in self.rivals], best) for estimate in self.estimates]
+        if best is not None and self.mirrors:
+            tracks = [mirror.p_n for mirror in self.mirrors]
+            self.estimates = [_covering_both(_covering(e, tracks, best), self.mirrors) for e in self.estimates]
         self.estimates.append(batch.dead_reckoning())
 
     def learns_by(self, search: Search) -> bool:
@@ -238,13 +269,22 @@ def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, o
     return {"time_s": float(best.problem.time[keyframe]), "m2": variance_sources(best, keyframe)}
 
 
-def _covering(estimate: Estimate, rivals: Sequence[Rival], best: Optimum) -> Estimate:
-    """An estimate whose sd covers where rivals among the explanations put the track."""
+def _covering_both(estimate: Estimate, mirrors: Sequence[MirroredBeacon]) -> Estimate:
+    """An estimate whose sds of beacons cover both of their places."""
+    apart = {f"{m.variable}{tail}": m.apart[k] for m in mirrors for k, tail in enumerate(("_north", "_east"))}
+    entries = [
+        replace(entry, sd=float(np.hypot(entry.sd, apart.get(entry.label, 0.0)))) for entry in estimate.calibration
+    ]
+    return replace(estimate, calibration=entries)
+
+
+def _covering(estimate: Estimate, rivals: Sequence[Array], best: Optimum) -> Estimate:
+    """An estimate whose sd covers other places of the keyframes, shape (n, 3) each."""
     track, posterior = estimate.trajectory, estimate.posterior
     cov_p = track.cov_p.copy()
-    for rival in rivals:
-        if len(rival.p_n) == len(track):
-            d = (rival.p_n - best.state.p_n)[:, :2]
+    for p_n in rivals:
+        if len(p_n) == len(track):
+            d = (p_n - best.state.p_n)[:, :2]
             cov_p[:, :2, :2] += d[:, :, None] * d[:, None, :]
             posterior = posterior and posterior.also(d)
     return replace(estimate, trajectory=replace(track, cov_p=cov_p), posterior=posterior)

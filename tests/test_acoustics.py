@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from rovgraph.geometry import exp_rotation, matrix_from_rpy
 from rovgraph.kernels import measurement_row as at
 from rovgraph.model.calibration import LAYOUT, TABLE, USBL_MOUNT
 from rovgraph.model.state import State
-from rovgraph.geometry import exp_rotation, matrix_from_rpy
 from rovgraph.sensors import AcousticExchange
 
 VARIABLES = (
@@ -42,7 +42,7 @@ def context(rng: np.random.Generator, n: int, inverted: bool, ways: float, beaco
 
 def state(rng: np.random.Generator, n: int) -> State:
     return State(
-        matrix_from_rpy(rng.normal(0, 0.5, (n, 3))), rng.normal(0, 30, (n, 3)) + [0, 0, 60], rng.normal(0, 1, (n, 3)),
+        matrix_from_rpy(rng.normal(0, 0.5, (n, 3))), rng.normal((0, 0, 60), 30, (n, 3)), rng.normal(0, 1, (n, 3)),
         np.zeros((n, 6)), {name: rng.normal(0, 0.1, TABLE[name].dim) for name in VARIABLES},
     )  # fmt: skip
 
@@ -54,7 +54,7 @@ def test_derivatives_of_an_exchange_are_those_of_finite_differences(inverted: bo
     rng, n, step = np.random.default_rng(3), 20, 1e-6
     model = AcousticExchange("usbl", dim, np.zeros(3), VARIABLES, context(rng, n, inverted, ways, dim == 1))
     at_state, still = state(rng, n), np.zeros((n, 3))
-    z, H = model.predict(at_state, still)
+    _, H = model.predict(at_state, still)
     for variable, jacobian in H.items():
         for k in range(jacobian.shape[2]):
             d = np.zeros(jacobian.shape[2])

@@ -20,6 +20,8 @@ from fault_campaign.vehicle import Triple
 
 Place = Callable[[Array], Array]  # times, shape (n,), to north, east, depth, shape (n, 3) [m]
 
+STILL, ROLLS, PITCHES = Profile(), Profile(0.0, (), ((0.05, 8.3, 0.4),)), Profile(0.0, (), ((0.03, 6.9, 1.2),))
+
 
 @dataclass
 class Ship:
@@ -35,11 +37,11 @@ class Ship:
     rate, heading_rate : of its position and of its attitude [Hz]
     """
 
-    north: Profile = Profile()
-    east: Profile = Profile()
-    heading: Profile = Profile()
-    roll: Profile = Profile(0.0, (), ((0.05, 8.3, 0.4),))
-    pitch: Profile = Profile(0.0, (), ((0.03, 6.9, 1.2),))
+    north: Profile = STILL
+    east: Profile = STILL
+    heading: Profile = STILL
+    roll: Profile = ROLLS
+    pitch: Profile = PITCHES
     antenna: Triple = (-5.0, 1.0, -12.0)
     head: Triple = (8.0, -2.0, 3.0)
     mount_rpy_deg: Triple = (0.0, 0.0, 0.0)

@@ -7,20 +7,22 @@ what is linear fitted: the head's mounting, and where dead reckoning begins, how
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import exp
 
 import numpy as np
 
-from rovgraph.errors import InputError
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation
 from rovgraph.inference.dead_reckoning import dead_reckon
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Stream
-from rovgraph.model.calibration import LAYOUT, USBL_MOUNT
+from rovgraph.model.calibration import LAYOUT, USBL_MOUNT, beacon_names
 from rovgraph.model.state import POSE, State
 from rovgraph.problem.acoustics import Acoustics
 from rovgraph.problem.initial_conditions import Beliefs, InitialConditions
 from rovgraph.problem.problem import Problem
+from rovgraph.rules import RULES
 from rovgraph.sensors import AcousticExchange
 
 LATENCY = "usbl_time_offset"
@@ -41,7 +43,12 @@ def find_latency(log: Log, problem: Problem, initial: InitialConditions) -> Unst
     log, problem, initial : the dive, assembled as it is believed to be
     """
     belief = initial.beliefs[LATENCY]
-    if "usbl" not in initial.instruments or "usbl" not in log or belief.estimate or not {"dvl", "dvl_water"} & log.sensors:
+    if (
+        "usbl" not in initial.instruments
+        or "usbl" not in log
+        or belief.estimate
+        or not {"dvl", "dvl_water"} & log.sensors
+    ):
         return None
     states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
     replies = log["usbl"]
@@ -136,12 +143,48 @@ def _interpolated(states: State, time: Array, wanted: Array, calibration: Mappin
     return State(R, p, v, states.bias[k], calibration)
 
 
+LEAST_AROUND_M, AROUND = 10.0, 0.1  # within which a beacon is sought from there on, part of its ranges
 FEWEST = 6  # ranges to a beacon whose place is unknown
 STARTS = 24  # of the search for a beacon, around the track
 DRIFT = 0.02  # of dead reckoning, part of the distance
 SAME_M = 3.0  # places that near are one
-RUNNER_UP = 12.0  # cost that a mirrored place may have beyond the best for both to be kept
+RUNNER_UP = 50.0  # cost beyond the best's, by dead reckoning, up to which the dive is solved with a mirrored place, too
 DOWN_SD = 20.0  # of a beacon of which nothing shows the depth [m]
+
+
+@dataclass(frozen=True)
+class MirroredBeacon:
+    """A second place of a beacon, with which the dive was solved, too.
+
+    Attributes
+    ----------
+    name, variable : as the configuration and the calibration name it
+    place, apart : ndarray, shape (2,), north and east, and from there to the better place [m]
+    margin : cost beyond the better place's
+    p_n : ndarray, shape (n, 3), where the keyframes are with it [m]
+    """
+
+    name: str
+    variable: str
+    place: Array
+    apart: Array
+    margin: float
+    p_n: Array
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the dive does not tell the two apart."""
+        return exp(-self.margin) > RULES["close"].doubtful
+
+    @property
+    def cause(self) -> str:
+        """Both places, in words."""
+        here, there = self.place + self.apart, self.place
+        return (
+            f"beacon {self.name} may lie at north {here[0]:.0f} m, east {here[1]:.0f} m or, mirrored, at north "
+            f"{there[0]:.0f} m, east {there[1]:.0f} m: a cost difference of only {self.margin:.1f} tells; "
+            "the stated sd covers both"
+        )
 
 
 @dataclass(frozen=True)
@@ -150,21 +193,36 @@ class BeaconPlaces:
 
     Attributes
     ----------
-    name, variable : as the configuration and the calibration name it
+    name, number : as the configuration names it, and which of ``beacons`` it is, from 0
     best, other : ndarray, shape (3,), north, east, down; ``other`` is a mirrored place that explains as much, or None
-    down_sd : of its depth to begin with [m]
+    sd, down_sd : with which the estimate begins there, far wider than where it ends; 0 = of a depth as stated [m]
     """
 
     name: str
-    variable: str
+    number: int
     best: Array
     other: Array | None
+    sd: float
     down_sd: float
 
+    @property
+    def text(self) -> str:
+        """What is assumed, in a line."""
+        north, east = self.best[:2]
+        return (
+            f"beacon {self.name} begins where its ranges along dead reckoning put it, north {north:.0f} m, east "
+            f"{east:.0f} m, within {self.sd:.0f} m"
+        )
+
+    @property
+    def variable(self) -> str:
+        """Of the calibration, that has its north and east."""
+        return beacon_names(self.number)[0]
+
     def beliefs(self, initial: InitialConditions, place: Array) -> Beliefs:
-        """The beacon at a place, as vaguely known as before."""
-        down = f"{self.variable}_down"
-        found = {self.variable: replace(initial.beliefs[self.variable], mean=place[:2].copy())}
+        """The beacon at a place."""
+        variable, down = beacon_names(self.number)
+        found = {variable: replace(initial.beliefs[variable], mean=place[:2].copy(), sd=self.sd)}
         if self.down_sd:
             found[down] = replace(initial.beliefs[down], mean=place[2:].copy(), sd=self.down_sd)
         return Beliefs(found)
@@ -181,13 +239,13 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
     for k, beacon in enumerate(initial.config.beacons):
         if beacon.north_m is not None or "range" not in initial.instruments:
             continue
-        variable = f"beacon_{k + 1}"
+        variable = beacon_names(k)[0]
         rows = problem.of_sensor("range")
         rows = rows[problem.contexts(rows)[:, at.BEACON_AT] == LAYOUT[variable].start]
         if len(rows) < FEWEST:
             raise InputError(
-                f"{log.source}: {len(rows)} ranges to beacon {beacon.name}, whose place is unknown; {FEWEST} are needed: "
-                f"state beacons: [{{name: {beacon.name}, north_m: .., east_m: ..}}], or leave it out"
+                f"{log.source}: {len(rows)} ranges to beacon {beacon.name}, whose place is unknown; {FEWEST} are "
+                f"needed: state beacons: [{{name: {beacon.name}, north_m: .., east_m: ..}}], or leave it out"
             )
         states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
         there = _interpolated(states, problem.time, problem.rows[rows, at.TIME], {})
@@ -197,7 +255,8 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
         down, down_sd = _depth_of_bottom(log, beacon.down_m, there.p_n)
         places = _trilaterate(there.p_n, problem.z(rows, 1)[:, 0], sd, down, down_sd or beacon.down_sd_m)
         other = next((p for p, cost in places[1:] if cost - places[0][1] < RUNNER_UP), None)
-        out.append(BeaconPlaces(str(beacon.name), variable, places[0][0], other, down_sd))
+        around = max(LEAST_AROUND_M, AROUND * float(np.median(problem.z(rows, 1))))
+        out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, around, down_sd))
     return out
 
 

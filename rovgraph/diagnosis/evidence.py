@@ -62,6 +62,7 @@ class Evidence:
     revealed : sensor and cause of what the dive revealed, with which it was solved again
     before : track before it was; None = it was not
     rivals : what explains the dive as clearly as what was found
+    ambiguities : what explains it nearly as well, in words, with the cost that it has more; sensor, cause, cost
     """
 
     initial: InitialConditions
@@ -76,6 +77,7 @@ class Evidence:
     revealed: Sequence[tuple[str, str]] = ()
     before: Trajectory | None = None
     rivals: Sequence[Rival] = ()
+    ambiguities: Sequence[tuple[str, str, float]] = ()
 
     def estimate(self, kind: str) -> Estimate | None:
         """The estimate of a kind, if it was made."""

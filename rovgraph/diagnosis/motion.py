@@ -270,6 +270,9 @@ def excluded_interval(stretch: FaultyInterval, start: float) -> Statistic:
 
 def ambiguous_optimum(evidence: Evidence) -> Iterator[Statistic]:
     """Likelihood of the next best optimum against the one that was chosen."""
+    for sensor, cause, cost in evidence.ambiguities:
+        remedy = "turn, or pass the beacon on its other side; or state its place under beacons"
+        yield Statistic("close", sensor, evidence.start, evidence.end, exp(-cost), cause, remedy)
     if evidence.optimum is None or not isfinite(evidence.optimum.solution.runner_up):
         return
     margin = evidence.optimum.solution.runner_up

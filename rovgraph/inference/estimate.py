@@ -345,7 +345,7 @@ def calibration_estimates(
     """
     out = []
     for name, belief in beliefs.items():
-        if not set(belief.variable.sensors) & set(sensors):
+        if not belief.is_shown_by(sensors):
             continue
         estimated = name in covariance
         considered = belief.considered and not estimated

@@ -477,7 +477,9 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)
     elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
-    without_heading = [s for s in sensors if s in present - elsewhere - unusable.keys() and SENSORS[s].heading_source is None]
+    without_heading = [
+        s for s in sensors if s in present - elsewhere - unusable.keys() and SENSORS[s].heading_source is None
+    ]
     used = without_heading + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))

@@ -67,7 +67,7 @@ def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = N
     names : calibration variables; those that are estimated, or whose sensor is not in use, are passed over
     """
     used, beliefs = {*best.chain.blocks, "imu"}, dict(best.beliefs)
-    held = [n for n in names if n not in best.unknowns.estimated and used & set(beliefs[n].variable.sensors)]
+    held = [n for n in names if n not in best.unknowns.estimated and beliefs[n].is_shown_by(used)]
     for name in held:
         belief = beliefs[name]
         beliefs[name] = replace(belief, estimate=True, sd=WIDE * belief.variable.sd, walk=0.0)

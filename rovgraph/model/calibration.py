@@ -18,6 +18,7 @@ it is. They have a second, wider sd, for a compass without a stated calibration 
 the two holds depends on the log (`rovgraph.inference.assumptions`), unless the configuration states one.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,15 +156,23 @@ BEACONS = 8  # that a dive may have
 _MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
 
 
+def beacon_names(k: int) -> tuple[str, str]:
+    """Variables of the k-th beacon: its north and east, and its depth."""
+    return f"beacon_{k + 1}", f"beacon_{k + 1}_down"
+
+
 def _beacon(k: int) -> tuple[Variable, Variable]:
     """North and east of an acoustic beacon, and its depth; `Config.beacons` states their priors."""
     shown = "a path about it, with turns; ranges alone leave a mirrored place on a straight leg"
     about = f"beacon {k + 1} of beacons"
-    place = f"beacon_{k + 1}", _MARKS[2 * k], ("_north", "_east"), "m", 1000.0, ACOUSTICS
-    down = f"beacon_{k + 1}_down", _MARKS[2 * k + 1], _ONE, "m", 10.0, ACOUSTICS
+    names = beacon_names(k)
+    place = names[0], _MARKS[2 * k], ("_north", "_east"), "m", 1000.0, ACOUSTICS
+    down = names[1], _MARKS[2 * k + 1], _ONE, "m", 10.0, ACOUSTICS
     return (
         Variable(*place, f"place of {about}, north and east", shown, estimate=True),
-        Variable(*down, f"depth of {about}", "passing near it; the depth that a chart or a sounder shows", estimate=True),
+        Variable(
+            *down, f"depth of {about}", "passing near it; the depth that a chart or a sounder shows", estimate=True
+        ),
     )
 
 
@@ -499,7 +508,12 @@ TABLE: dict[str, Variable] = {
             considered=True,
         ),
         _time_offset(
-            "usbl", "K", 0.5, ("usbl",), "the stamps of acoustic positions are", "the ship turning, or legs beside a DVL"
+            "usbl",
+            "K",
+            0.5,
+            ("usbl",),
+            "the stamps of acoustic positions are",
+            "the ship turning, or legs beside a DVL",
         ),
         Variable(
             "usbl_direction_error",
@@ -567,7 +581,9 @@ TABLE: dict[str, Variable] = {
             "motion that the IMU and the DVL measure better over its time constant",
             time_constant=60.0,
         ),
-        _time_offset("range", "S", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"),
+        _time_offset(
+            "range", "S", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"
+        ),
         *(variable for k in range(BEACONS) for variable in _beacon(k)),
     )
 }
@@ -634,6 +650,7 @@ class Belief:
     score : ndarray, shape (dim,), derivative of the log likelihood that noise has taken from the measurements
         (`rovgraph.inference.lever_arm_bias`) [1/unit]
     changes : times at which it takes another value, by its sd, from its mean on; it is constant otherwise [s]
+    streams : log streams that show it as it is configured; None = the variable's
     """
 
     variable: Variable
@@ -645,6 +662,12 @@ class Belief:
     time_constant: float = np.inf
     score: Array | float = 0.0
     changes: tuple[float, ...] = ()
+    streams: tuple[str, ...] | None = None
+
+    def is_shown_by(self, sensors: Iterable[str]) -> bool:
+        """Whether one of the sensors in use depends on it."""
+        of_it = self.variable.sensors if self.streams is None else self.streams
+        return not set(of_it).isdisjoint(sensors)
 
     @property
     def first_sd(self) -> float:

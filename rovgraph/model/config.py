@@ -31,7 +31,18 @@ from ruamel.yaml.error import YAMLError
 from rovgraph import compatibility
 from rovgraph.errors import InputError, as_path, kind_of, warn
 from rovgraph.geometry import Array, matrix_from_rpy
-from rovgraph.model.calibration import AUTO, BEACONS, CONSIDERED, MOUNT, TABLE, USBL_MOUNT, Belief, Variable
+from rovgraph.model.calibration import (
+    ACOUSTICS,
+    AUTO,
+    BEACONS,
+    CONSIDERED,
+    MOUNT,
+    TABLE,
+    USBL_MOUNT,
+    Belief,
+    Variable,
+    beacon_names,
+)
 from rovgraph.model.config_errors import complaint, count
 from rovgraph.model.config_sections import (
     ANGLES_TEXT,
@@ -271,7 +282,9 @@ class Config(ConfigSection):
     range: RangeSettings = RangeSettings()
     ship: ShipSettings = ShipSettings()
     beacons: tuple[Beacon, ...] = Field(
-        (), max_length=BEACONS, description="acoustic beacons on the bottom: name, and north_m, east_m, down_m where known"
+        (),
+        max_length=BEACONS,
+        description="acoustic beacons on the bottom: name, and north_m, east_m, down_m where known",
     )
     sensors: RegisteredSensors = Field(default_factory=RegisteredSensors)
     calibration: Calibration = Field(default_factory=Calibration)
@@ -429,8 +442,13 @@ def beliefs(config: Config) -> dict[str, Belief]:
             entry.estimate == CONSIDERED,
             np.inf if lasts is None else lasts,
         )
+    shown = ACOUSTICS if config.usbl.head == "vehicle" else ("range",)
+    unused = ("range_offset",) if config.range.one_way else ("range_clock", "range_clock_drift")
+    for name in (*unused, *(v for k in range(len(config.beacons), BEACONS) for v in beacon_names(k))):
+        out[name] = replace(out[name], streams=())
     for k, beacon in enumerate(config.beacons):
-        place, down = f"beacon_{k + 1}", f"beacon_{k + 1}_down"
+        place, down = beacon_names(k)
+        out[place], out[down] = replace(out[place], streams=shown), replace(out[down], streams=shown)
         if beacon.north_m is not None and beacon.east_m is not None:
             out[place] = replace(out[place], mean=np.array([beacon.north_m, beacon.east_m]), sd=beacon.sd_m)
         if beacon.down_m is not None:

@@ -20,7 +20,7 @@ from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import label_number
-from rovgraph.model.calibration import LAYOUT, USBL_MOUNT
+from rovgraph.model.calibration import LAYOUT, USBL_MOUNT, beacon_names
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.sensors.acoustic import AcousticExchange
 from rovgraph.sensors.instruments import Instrument
@@ -156,10 +156,10 @@ class Acoustics:
         out = []
         for one in ready:
             row = np.array([one.row])
-            stream = self.exchanges(
-                Stream(one.sensor, (), np.array([one.time]), one.values[None], row), late, left_out
-            )
-            out += [Measurement(float(t), one.sensor, v, one.row) for t, v in zip(stream.time, stream.data, strict=True)]
+            stream = self.exchanges(Stream(one.sensor, (), np.array([one.time]), one.values[None], row), late, left_out)
+            out += [
+                Measurement(float(t), one.sensor, v, one.row) for t, v in zip(stream.time, stream.data, strict=True)
+            ]
         return out
 
     def _known_until(self) -> float:
@@ -293,7 +293,9 @@ class Acoustics:
         stated = self.config.usbl.beacon
         known = np.unique(label[~np.isnan(label)])
         if stated is not None:
-            why.append(("another transponder than usbl.beacon", ~np.isnan(label) & (label != label_number(str(stated)))))
+            why.append(
+                ("another transponder than usbl.beacon", ~np.isnan(label) & (label != label_number(str(stated))))
+            )
         elif len(known) > 1:
             shown = ", ".join(f"{name:g}" for name in known[:6].tolist())
             raise InputError(
@@ -384,8 +386,8 @@ class Acoustics:
         context[:, at.MOUNT_AT : at.WIDTH] = [LAYOUT[name].start if name in known else -1 for name in names]
         for k, other in enumerate(others):
             if other.beacon >= 0:
-                name = f"beacon_{other.beacon + 1}"
-                context[k, at.BEACON_AT], context[k, at.DOWN_AT] = LAYOUT[name].start, LAYOUT[f"{name}_down"].start
+                place, down = (LAYOUT[name].start for name in beacon_names(other.beacon))
+                context[k, at.BEACON_AT], context[k, at.DOWN_AT] = place, down
 
     def _noise(self, stream: Stream, length: Array, known: NDArray[np.bool_], seen: Array, ship: Array) -> Array:
         """Sds of range, across and up, shape (n, 3), with what the ship's place and attitude add to them."""
@@ -456,8 +458,6 @@ def rough_positions(log: Log, config: Config, instruments: Mapping[str, Instrume
     across = z[:, 0] * np.max(sd[:, 1:], axis=1)
     columns = "fix_north", "fix_east", "down", "fix_sd"
     return Stream("usbl", columns, stream.time, np.column_stack([p, np.hypot(across, sd[:, 0])]), stream.row)
-
-
 
 
 def unusable_acoustics(config: Config, sensors: Collection[str]) -> dict[str, str]:

@@ -188,9 +188,9 @@ class Assembly:
 
     def _insert_acoustic(self, m: Measurement, settled: float) -> InsertResult:
         """Take what the ship or an acoustic system says, and exchanges that it completes."""
-        if m.sensor in self._acoustics.instruments:
-            if not admitted(m.sensor, m.values[None], self.config, self._left_out).all():
-                return InsertResult.IN
+        reply = m.sensor in self._acoustics.instruments
+        if reply and not admitted(m.sensor, m.values[None], self.config, self._left_out).all():
+            return InsertResult.IN
         late = max((self.time_offsets.of_sensor(s) for s in self._acoustics.instruments), default=0.0)
         results = [
             self._insert(one) if one.time >= settled else InsertResult.LATE

@@ -71,7 +71,7 @@ class CalibrationRoles:
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> CalibrationRoles:
     """Calibration variables to be estimated or considered: asked for, and a sensor that shows them is in use."""
     present = {*sensors, "imu"}
-    used = {n: b for n, b in beliefs.items() if present & set(b.variable.sensors)}
+    used = {n: b for n, b in beliefs.items() if b.is_shown_by(present)}
     wanted = {n: b.walk for n, b in used.items() if b.estimate}
     considered = tuple(n for n, b in used.items() if b.considered)
     lasting = {n: used[n].time_constant for n in wanted if np.isfinite(used[n].time_constant)}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
 from rovgraph.kernels.measurement_row import WIDTH
-from rovgraph.model.calibration import USBL_MOUNT
+from rovgraph.model.calibration import USBL_MOUNT, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
@@ -61,8 +61,7 @@ class AcousticExchange:
 
 def beacon_variables(config: Config) -> tuple[str, ...]:
     """Calibration variables of the places of the beacons that a configuration names."""
-    names = (f"beacon_{k + 1}" for k in range(len(config.beacons)))
-    return tuple(variable for name in names for variable in (name, f"{name}_down"))
+    return tuple(variable for k in range(len(config.beacons)) for variable in beacon_names(k))
 
 
 def positioning_head(config: Config, origin_b: Array) -> Instrument:

@@ -18,7 +18,14 @@ from rovgraph.model.calibration import Variable
 from rovgraph.model.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.sensors.model import SensorModel
 
-RESERVED = ("time", "received", "fix_lat", "fix_lon", "ship_lat", "ship_lon")  # columns of a log that belong to no sensor
+RESERVED = (
+    "time",
+    "received",
+    "fix_lat",
+    "fix_lon",
+    "ship_lat",
+    "ship_lon",
+)  # columns of a log that belong to no sensor
 LARGEST_SD = 1e6  # of a measurement's own: larger ones add no information, and overflow
 NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 99.9, 99.99, 999 ...
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
