@@ -73,6 +73,7 @@ from rovgraph.model.config_sections import (
     RegisteredSensors,
     SensorSettings,
     ShipSettings,
+    Sound,
     StartSettings,
     TableSettings,
     TiltSettings,
@@ -281,6 +282,7 @@ class Config(ConfigSection):
     usbl: Usbl = Usbl()
     range: RangeSettings = RangeSettings()
     ship: ShipSettings = ShipSettings()
+    sound: Sound = Sound()
     beacons: tuple[Beacon, ...] = Field(
         (),
         max_length=BEACONS,

@@ -271,6 +271,10 @@ class Usbl(AcousticSettings):
     beacon: str | int | None = Field(None, description="usbl_beacon of the vehicle's transponder; null = the only one")
     range_sd_m: Positive = Field(0.3, description="noise of a range; usbl_range_sd takes precedence")
     angle_sd_deg: Positive = Field(1.0, description="noise of a direction; usbl_angle_sd takes precedence")
+    depth: Literal["measured", "given"] = Field(
+        "measured",
+        description="given: elevation or z come from the vehicle's own depth sensor, and are not used again",
+    )
     planar: bool = Field(True, description="a head that looks down: less precise towards its horizon")
 
 
@@ -279,6 +283,16 @@ class RangeSettings(AcousticSettings):
 
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the transducer in body axes")
     sd_m: Positive = Field(0.5, description="noise of a range; range_sd takes precedence")
+
+
+class Sound(ConfigSection):
+    """Sound in the water."""
+
+    profile: tuple[tuple[float, float], ...] | str | None = Field(
+        None,
+        description="its speed by depth: rows of depth [m] and speed [m/s], or a CSV file with depth and sound_speed, or "
+        "depth, temperature and salinity",
+    )
 
 
 class Beacon(ConfigSection):

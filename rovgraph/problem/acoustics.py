@@ -25,10 +25,12 @@ from rovgraph.model.config import Config, mount_matrix
 from rovgraph.sensors.acoustic import AcousticExchange
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import LARGEST_SD
+from rovgraph.sensors.sound import profile_of
 
 SHIP = "ship", "ship_heading", "ship_tilt"  # streams
 UNKNOWN_TILT_SD = math.radians(3.0)  # of a ship without ship_roll and ship_pitch, taken as level
 EDGE_SINE = math.sin(math.radians(5.0))  # nearer to its horizon no planar head measures
+DEPTH_GAP_S = 30.0  # over which the vehicle's depth is interpolated for the speed of sound
 REMEMBERED_S = 600.0  # of the ship's motion, online
 Left = Counter[tuple[str, str]]
 
@@ -125,14 +127,18 @@ class Acoustics:
             self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
         self.since: float | None = None  # time of the first exchange, from which a clock drifts [s]
+        self._profile = profile_of(config.sound.profile)
+        if self._profile is not None:
+            self.tracks["depth"] = Track(1, False)  # of the vehicle, where ranges are made with the speed between
+        self._deepest = -math.inf
         self._places = {label_number(str(beacon.name)): k for k, beacon in enumerate(config.beacons)}
         self._receivers = {label_number(name): np.array(arm) for name, arm in config.ship.receivers.items()}
 
     # what comes
 
     def take_ship(self, streams: Mapping[str, Stream]) -> None:
-        """What a log has of the ship."""
-        for sensor in SHIP:
+        """What a log has of the ship, and of depth where that counts."""
+        for sensor in self.tracks:
             if sensor in streams and len(streams[sensor]):
                 self.tracks[sensor].take(streams[sensor].time, streams[sensor].data)
 
@@ -143,7 +149,7 @@ class Acoustics:
         ----------
         late : how late stamps of exchanges are taken to be [s]
         """
-        if m.sensor in SHIP:
+        if m.sensor in self.tracks:
             self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
             self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
         else:
@@ -164,7 +170,11 @@ class Acoustics:
 
     def _known_until(self) -> float:
         """Up to when all is known of the ship that it has told of so far."""
-        ends = [float(track.time[-1]) for track in self.tracks.values() if len(track.time) and track.held is None]
+        ends = [
+            float(self.tracks[sensor].time[-1])
+            for sensor in SHIP
+            if len(self.tracks[sensor].time) and self.tracks[sensor].held is None
+        ]
         return min(ends, default=math.inf)
 
     def _needs_ship(self, sensor: str) -> bool:
@@ -193,7 +203,7 @@ class Acoustics:
         seen = self._direction(stream.data) if sensor == "usbl" else np.zeros((n, 3))
         length, exact = self._length(stream)
         names, others = self._others(stream, why)
-        c, settings = self._sound_speed(), self._settings(sensor)
+        c, settings = self._sound_speed(sensor), self._settings(sensor)
         way, wait = length / c, settings.turn_around_s
         heard = stream.time - late
         context = np.zeros((n, at.WIDTH))
@@ -225,6 +235,8 @@ class Acoustics:
         sds = self._noise(stream, length, exact, seen, sd)
         z = np.zeros((n, dim))
         z[:, 0] = length
+        if self._profile is not None:
+            self._unbend(sensor, time, z, context, others)
         usable = np.ones(n, bool)
         for reason, bad in why:
             if (bad & usable).any():
@@ -238,8 +250,8 @@ class Acoustics:
     def _settings(self, sensor: str) -> Any:
         return self.config.usbl if sensor == "usbl" else self.config.range
 
-    def _sound_speed(self) -> float:
-        return self.config.usbl.sound_speed_mps
+    def _sound_speed(self, sensor: str) -> float:
+        return float(self._settings(sensor).sound_speed_mps)
 
     def _length(self, stream: Stream) -> tuple[Array, NDArray[np.bool_]]:
         """One-way length of each [m], 0 where it is unknown; and whether it is known."""
@@ -357,6 +369,40 @@ class Acoustics:
         )
         return sd * on_ship[:, None]
 
+    def _unbend(self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other]) -> None:
+        """Replace ranges and directions, made with one speed of sound, by those of straight lines, in place."""
+        profile, believed = self._profile, self._sound_speed(sensor)
+        if profile is None or not len(z):
+            return
+        heard = context[:, at.HEARD + 2]
+        if sensor != "usbl" or self.config.usbl.head == "vehicle":
+            lower = np.array([self._depth_of(other) for other in others])
+            vehicle = np.nan_to_num(self.tracks["depth"].at(time, DEPTH_GAP_S)[0][:, 0])
+            z[:, 0] *= profile.mean(vehicle, np.where(np.isnan(lower), profile.depth[-1], lower)) / believed
+            return
+        R_nf = context[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(self.config.usbl.mount_rpy_deg)
+        u_n = rotate(R_nf, context[:, at.SEEN : at.SEEN + 3])
+        level = np.hypot(u_n[:, 0], u_n[:, 1])
+        across, down = profile.trace(float(np.median(heard)), np.arctan2(u_n[:, 2], level), z[:, 0] / believed)
+        straight = np.isnan(across)  # it turns back: the mean speed is all there is
+        mean = profile.mean(heard, heard + z[:, 0] * u_n[:, 2]) / believed
+        length = np.where(straight, z[:, 0] * mean, np.hypot(across, down))
+        turned = np.column_stack([u_n[:, :2] / np.maximum(level, 1e-9)[:, None] * across[:, None], down])
+        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
+        u_n = np.where(straight[:, None], u_n, turned)
+        z[:, 0], context[:, at.SEEN : at.SEEN + 3] = length, rotate(np.swapaxes(R_nf, 1, 2), u_n)
+        deepest = float(np.percentile(heard + length * u_n[:, 2], 95))
+        if deepest > self._deepest:
+            profile.warn_beyond(deepest if self._deepest == -math.inf else -math.inf)
+            self._deepest = deepest
+
+    def _depth_of(self, other: Other) -> float:
+        """Depth of a beacon as stated, 0 of the ship, NaN where it is not known [m]."""
+        if other.beacon < 0:
+            return 0.0
+        down = self.config.beacons[other.beacon].down_m
+        return math.nan if down is None else down
+
     def _pose(self, time: Array) -> Pose:
         """The ship at some times."""
         longest, n = self.config.ship.max_gap_s, len(time)
@@ -404,6 +450,8 @@ class Acoustics:
         down = np.abs(seen[:, 2] if self.config.usbl.head == "ship" else 1.0)
         level = np.sqrt(np.maximum(1.0 - seen[:, 2] ** 2, 0.0))
         up = angle / np.maximum(down, EDGE_SINE) if self.config.usbl.planar else angle
+        if self.config.usbl.depth == "given":
+            up = np.full(len(stream), LARGEST_SD)
         moved = place / np.maximum(length, 1.0)
         out[:, 1] = np.sqrt(angle**2 + moved**2 + (heading * level) ** 2 + tilt**2)
         out[:, 2] = np.sqrt(up**2 + moved**2 + tilt**2)

@@ -184,6 +184,8 @@ class Assembly:
             return InsertResult.IN if self._no_imu else self._insert_sample(m.time, m.values[:6], m.row)
         if m.sensor in SHIP or m.sensor in self._acoustics.instruments:
             return self._insert_acoustic(m, settled)
+        if m.sensor in self._acoustics.tracks:
+            self._acoustics.tracks[m.sensor].take(np.array([m.time]), m.values[None])
         return self._insert(m)
 
     def _insert_acoustic(self, m: Measurement, settled: float) -> InsertResult:
