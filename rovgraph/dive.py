@@ -17,7 +17,7 @@ from rovgraph.diagnosis import (
     statistics,
     verdict_of,
 )
-from rovgraph.diagnosis.acoustics import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons, find_latency
+from rovgraph.diagnosis.acoustics import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons, find_head_errors
 from rovgraph.diagnosis.check import Finding
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.geometry import Array
@@ -161,9 +161,8 @@ class _Solver:
     def look_ahead(self) -> None:
         """Believe what dead reckoning shows of an acoustic system, before the dive is solved."""
         if "usbl" in self.initial.instruments and self.initial.config.graph.find_noise:
-            found = find_latency(self.log, assemble(self.log, self.initial).problem, self.initial)
-            if found is not None:
-                self.initial, self.found = self.initial.believing(found.beliefs), (found,)
+            for one in find_head_errors(self.log, assemble(self.log, self.initial).problem, self.initial):
+                self.initial, self.found = self.initial.believing(one.beliefs), (*self.found, one)
         if "range" in self.initial.instruments:
             self.beacons = find_beacons(self.log, assemble(self.log, self.initial).problem, self.initial)
             for beacon in self.beacons:

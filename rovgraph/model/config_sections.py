@@ -290,8 +290,8 @@ class Sound(ConfigSection):
 
     profile: tuple[tuple[float, float], ...] | str | None = Field(
         None,
-        description="its speed by depth: rows of depth [m] and speed [m/s], or a CSV file with depth and sound_speed, or "
-        "depth, temperature and salinity",
+        description="its speed by depth: rows of depth [m] and speed [m/s], or a CSV file with depth and sound_speed, "
+        "or with depth, temperature and salinity",
     )
 
 

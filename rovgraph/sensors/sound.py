@@ -1,8 +1,8 @@
 """Sound in layered water: what ranges and angles say that were made with one speed.
 
-Along a ray cos(angle) / c is constant (Snell). For a range the harmonic mean of the speed between both depths is enough,
-to 0.1 m at 1000 m; the angle that a head sees is bent, the more the flatter the ray. `SoundSpeedProfile.trace` goes
-through thin layers; with a constant gradient g the closed form that it is tested by is
+Along a ray cos(angle) / c is constant (Snell). For a range the harmonic mean of the speed between both depths is
+enough, to 0.1 m at 1000 m; the angle that a head sees is bent, the more the flatter the ray. `SoundSpeedProfile.trace`
+goes through thin layers; with a constant gradient g the closed form that it is tested by is
 
     t = arccosh(1 + g^2 (X^2 + dz^2) / (2 c1 c2)) / |g|
 """
@@ -89,8 +89,8 @@ class SoundSpeedProfile:
         """Warn where a vehicle goes deeper than the profile."""
         if deepest > self.depth[-1] + BEYOND_M:
             warn(
-                f"sound.profile ends at {self.depth[-1]:.0f} m and the vehicle goes to {deepest:.0f} m: the speed is taken "
-                "to stay below; measure it as deep as the dive"
+                f"sound.profile ends at {self.depth[-1]:.0f} m and the vehicle goes to {deepest:.0f} m: the speed is "
+                "taken to stay below; measure it as deep as the dive"
             )
 
 

@@ -1,0 +1,258 @@
+"""Acoustic positioning against truth: a ship, its head, receivers and beacons, by an independent simulator.
+
+    python benchmarks/acoustics.py                         every row, 20 seeds
+    python benchmarks/acoustics.py --rows "one beacon" --seeds 3 --online
+
+prints a table in Markdown: horizontal rms error and NEES of the smoothed, filtered and online estimates, and what
+calibration was found. Dives go through the command line.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from fault_campaign.acoustic import Acoustic, Ship, System, ranges, usbl
+from fault_campaign.campaign import merge
+from fault_campaign.instruments import Streams, sample
+from fault_campaign.judge import Dive, Result, run_dive
+from fault_campaign.motion import Motion, Profile
+from fault_campaign.scenarios import make_motion
+from fault_campaign.vehicle import configuration, make_vehicle
+
+from rovgraph.lab.executors import cores, starting, workers
+
+AIDS = ("ahrs", "depth")
+CREW = {  # what a crew that has calibrated its system states
+    "usbl_roll": {"estimate": True, "sd_deg": 0.3},
+    "usbl_pitch": {"estimate": True, "sd_deg": 0.3},
+    "usbl_yaw": {"estimate": True, "sd_deg": 0.5},
+}
+
+
+@dataclass
+class Setting:
+    """A dive with a USBL.
+
+    Attributes
+    ----------
+    seconds, depth : [s], [m]
+    round_ship : the vehicle goes once round the ship; else legs below it
+    dvl : there is one
+    yaw, latency : of the head [deg], of its stamps [s], that the configuration does not state
+    outliers : share of replies that are off by 50 m
+    crew : the configuration states what a careful crew knows
+    speed, profile : of sound, believed to be 1500 m/s; gradient with depth [1/s]
+    changed : on the replies
+    config : beside all that
+    """
+
+    seconds: float = 600.0
+    depth: float = 100.0
+    round_ship: bool = False
+    dvl: bool = True
+    yaw: float = 0.0
+    latency: float = 0.0
+    outliers: float = 0.0
+    crew: bool = True
+    speed: float = 1500.0
+    changed: Callable[[pd.DataFrame, np.random.Generator], pd.DataFrame] | None = None
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+def below_ship(setting: Setting, seed: int) -> Dive:
+    """A vehicle below a ship that moves and turns, with a head of 0.2 m and 0.5 deg at 1 Hz."""
+    rng = np.random.default_rng([7, seed])
+    motion = replace(make_motion("survey of 20 minutes", rng), duration=setting.seconds, depth=setting.depth)
+    if setting.round_ship:
+        heading = replace(motion.heading, ramps=((20.0, setting.seconds - 40.0, 2 * np.pi),))
+        velocity = Profile(0.0, ((8.0, 4.0, 0.5),), motion.velocity_b[0].waves), *motion.velocity_b[1:]
+        motion = replace(motion, heading=heading, velocity_b=velocity)
+    middle = motion.local(np.arange(0.0, setting.seconds, 1.0)).mean(axis=0)
+    spin = rng.uniform(-np.pi, np.pi)
+    lever = np.concatenate([rng.normal(0.0, 0.3, 2), [setting.yaw]]) if setting.crew else np.array([0, 0, setting.yaw])
+    ship = Ship(
+        north=Profile(middle[0], (), ((8.0, 310.0, spin),)),
+        east=Profile(middle[1], (), ((6.0, 270.0, spin + 1.0),)),
+        heading=Profile(spin, ((150.0, 60.0, 0.6), (350.0, 60.0, -0.9))),
+        mount_rpy_deg=lever.tolist(),
+        heading_error=rng.normal(0.0, 0.3),
+    )
+    system = System(latency=setting.latency, sound_speed=setting.speed)
+    vehicle = make_vehicle("mti", AIDS)
+    config = merge(configuration(vehicle), Acoustic(ship, system).usbl())
+    config["start"] = {}
+    if setting.crew:
+        config = merge(config, {"calibration": CREW})
+    streams, hidden = sample(motion, vehicle, rng)
+    if not setting.dvl:
+        del streams["dvl"]
+    replies = usbl(motion, ship, system, rng)
+    if setting.outliers:
+        bad = rng.uniform(size=len(replies)) < setting.outliers
+        replies.loc[bad, "usbl_range"] += rng.choice([-50.0, 50.0], bad.sum())
+        replies.loc[bad, "usbl_bearing"] += rng.normal(0.0, 0.5, bad.sum())
+    if setting.changed is not None:
+        replies = setting.changed(replies, rng)
+    streams |= {"usbl": replies} | ship.says(setting.seconds, rng)
+    return Dive(streams, merge(config, setting.config), motion, hidden)
+
+
+def cluster(replies: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """460 s of silence, 20 s of replies that agree with each other 700 m away, and right ones again."""
+    replies = replies[(replies["time"] < 60.0) | (replies["time"] > 520.0)].copy()
+    wrong = replies["time"].between(520.0, 540.0)
+    far = np.hypot(700.0, 100.0)
+    replies.loc[wrong, "usbl_range"] = far + rng.normal(0.0, 0.2, wrong.sum())
+    replies.loc[wrong, "usbl_bearing"] = 1.0 + rng.normal(0.0, 0.005, wrong.sum())
+    replies.loc[wrong, "usbl_elevation"] = np.arcsin(97.0 / far)
+    return replies
+
+
+def square(seed: int, side: float = 200.0, straight: bool = False, seconds: float = 1200.0) -> tuple[Motion, Any]:
+    """A square at 1 m/s in 60 m of water, or one leg."""
+    rng = np.random.default_rng([9, seed])
+    motion = make_motion("survey of 20 minutes", rng)
+    every = side + 10.0
+    turns = [] if straight else [(0.6 * side + k * every, 10.0, np.pi / 2) for k in range(int(seconds / every))]
+    velocity = Profile(0.0, ((8.0, 4.0, 1.0),), motion.velocity_b[0].waves), *motion.velocity_b[1:]
+    heading = replace(motion.heading, ramps=tuple(turns))
+    return replace(motion, duration=seconds, depth=60.0, heading=heading, velocity_b=velocity), rng
+
+
+def one_beacon(seed: int, straight: bool = False, seconds: float = 1200.0) -> Dive:
+    """A beacon on the bottom whose place nobody knows, ranges at 0.2 Hz."""
+    return among_beacons(seed, 1, None, 0.2, 0.0, straight, seconds)
+
+
+def among_beacons(
+    seed: int,
+    count: int,
+    surveyed: float | None,
+    rate: float,
+    lost: float,
+    straight: bool = False,
+    seconds: float = 1200.0,
+) -> Dive:
+    """Beacons on the bottom, surveyed to some sd, and for some time no DVL."""
+    motion, rng = square(seed, straight=straight, seconds=seconds)
+    vehicle, system = make_vehicle("mti", AIDS), System(rate=rate)
+    middle = motion.local(np.arange(0.0, seconds, 1.0)).mean(axis=0)
+    places = {str(k + 1): tuple(middle + np.append(rng.uniform(-150.0, 150.0, 2), 20.0)) for k in range(count)}
+    known = {
+        name: None if surveyed is None else tuple(np.array(place) + rng.normal(0.0, surveyed, 3))
+        for name, place in places.items()
+    }
+    config = merge(configuration(vehicle), Acoustic(Ship(), system).ranges(known, surveyed or 1.0))
+    streams, hidden = sample(motion, vehicle, rng)
+    streams["range"] = ranges(motion, places, system, rng)
+    if lost:
+        pings = streams["dvl"]
+        streams["dvl"] = pings[(pings["time"] < 300.0) | (pings["time"] > 300.0 + lost)]
+    return Dive(streams, config, motion, hidden)
+
+
+def ugps(seed: int, drift: float = 1.0) -> Dive:
+    """A vehicle below a boat's topside: x and y by sound, z by the locator's pressure sensor, a yaw that drifts."""
+    rng = np.random.default_rng([11, seed])
+    motion = replace(make_motion("survey of 20 minutes", rng), duration=600.0, depth=8.0)
+    middle = motion.local(np.arange(0.0, 600.0, 1.0)).mean(axis=0)
+    boat = Ship(
+        north=Profile(middle[0] + 12.0, (), ((1.0, 90.0, 0.0),)),
+        east=Profile(middle[1] - 9.0, (), ((1.0, 70.0, 1.0),)),
+        heading=Profile(0.7, (), ((0.1, 40.0, 0.2),)),
+        antenna=(0.0, 0.0, -1.0),
+        head=(0.0, 0.0, 1.0),
+        position_sd=0.3,
+    )
+    system = System(rate=2.4, range_sd=0.06, angle_sd=0.4, turn_around=0.0, arm=(0.0, 0.0, -0.2))
+    vehicle = make_vehicle("mti", AIDS)
+    one = usbl(motion, boat, system, rng)
+    level = one["usbl_range"] * np.cos(one["usbl_elevation"])
+    z = motion.local(one["time"].to_numpy())[:, 2] - 1.0 + rng.normal(0.0, 0.02, len(one))
+    x, y = level * np.cos(one["usbl_bearing"]), level * np.sin(one["usbl_bearing"])
+    replies = pd.DataFrame({"time": one["time"], "usbl_x": x, "usbl_y": y, "usbl_z": z})
+    replies = replies[rng.uniform(size=len(replies)) > 0.3]
+    says = boat.says(600.0, rng)
+    says["ship_heading"]["ship_heading"] += np.deg2rad(drift) * says["ship_heading"]["time"] / 60.0
+    config = merge(configuration(vehicle), Acoustic(boat, system).usbl())
+    config = merge(
+        config, {"start": None, "usbl": {"frame": "ship", "depth": "given", "one_way": True, "planar": False}}
+    )
+    streams: Streams
+    streams, hidden = sample(motion, vehicle, rng)
+    del says["ship_heading"]["ship_roll"], says["ship_heading"]["ship_pitch"]
+    return Dive(streams | {"usbl": replies} | says, config, motion, hidden)
+
+
+UNSTATED = Setting(round_ship=True, yaw=3.0, latency=2.0, outliers=0.1, crew=False)
+ROWS: dict[str, Callable[[int], Dive]] = {
+    "USBL": lambda seed: below_ship(Setting(), seed),
+    "round the ship": lambda seed: below_ship(Setting(round_ship=True, crew=False), seed),
+    "the same, 2 s late, 3 deg off, 10 % outliers": lambda seed: below_ship(UNSTATED, seed),
+    "no DVL": lambda seed: below_ship(Setting(dvl=False), seed),
+    "one unknown beacon": one_beacon,
+    "one unknown beacon, straight leg": lambda seed: one_beacon(seed, True, 300.0),
+    "four beacons, no DVL for 5 min": lambda seed: among_beacons(seed, 4, 0.5, 0.5, 300.0),
+    "cluster after silence": lambda seed: below_ship(Setting(seconds=700.0, changed=cluster), seed),
+    "sound speed 1 % off, 1000 m": lambda seed: below_ship(Setting(depth=1000.0, speed=1515.0), seed),
+    "topside drifts 1 deg/min": ugps,
+    "topside does not drift": lambda seed: ugps(seed, 0.0),
+}
+
+
+def run_row(name: str, seed: int, online: bool) -> Result:
+    """One dive."""
+    return run_dive(ROWS[name](seed), online)
+
+
+def figures(name: str, results: Sequence[Result]) -> str:
+    """A row of the table."""
+    cells = [name]
+    for kind in ("smoothed", "filtered", "online"):
+        done = [r for r in results if kind in r.rms]
+        if not done:
+            cells += ["–", "–"]
+            continue
+        rms, sd = (float(np.sqrt(np.mean([getattr(r, what)[kind] ** 2 for r in done]))) for what in ("rms", "sd"))
+        nees = {q: float(np.mean([r.nees[kind][q] for r in done])) for q in ("position", "depth", "heading")}
+        cells += [f"{rms:.2f} ({sd:.2f})", "; ".join(f"{value:.2g}" for value in nees.values())]
+    verdicts = [r.verdicts.get("smooth", "refused") for r in results]
+    cells.append(", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts)))
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="ROW")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=cores())
+    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
+    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
+    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    arguments = parser.parse_args()
+    heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
+    print("| dive | " + " | ".join(heads) + " | verdicts |")
+    print("|---" * (len(heads) + 2) + "|", flush=True)
+    with workers(arguments.jobs) as pool:
+        for name in arguments.rows:
+            with starting():
+                futures = [pool.submit(run_row, name, seed, arguments.online) for seed in range(arguments.seeds)]
+            results = [future.result() for future in futures]
+            print(figures(name, results), flush=True)
+            if arguments.said:
+                print("\n".join(results[0].said), flush=True)
+            if arguments.keep:
+                from fault_campaign.judge import write_dive
+
+                folder = arguments.keep / name.replace(" ", "_").replace("%", "").replace(",", "")
+                folder.mkdir(parents=True, exist_ok=True)
+                write_dive(ROWS[name](0), folder)
+
+
+if __name__ == "__main__":
+    main()
