@@ -8,25 +8,32 @@ import pytest
 
 from rovgraph.errors import InputError
 from rovgraph.inference.graph.values import key, key_name
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import BEACONS, TABLE
 from rovgraph.model.config import Config, beliefs, parse_config
 from rovgraph.model.state import DIMENSION
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.motion import SCALES
-from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.instruments import Instrument, instruments
+
+
+def every_instrument(one_way: bool) -> dict[str, Instrument]:
+    """With as many beacons as a dive may have, on a vehicle that sees them."""
+    beacons = [{"name": k} for k in range(BEACONS)]
+    return instruments(Config().changed(beacons=beacons, usbl={"head": "vehicle"}, range={"one_way": one_way}))
 
 
 def test_every_variable_is_named_by_a_measurement_model():
-    named = {name for i in instruments(Config()).values() for name in i.calibration} | set(SCALES)
-    assert named == set(TABLE)
+    every = [i for one_way in (False, True) for i in every_instrument(one_way).values()]
+    assert {name for i in every for name in i.calibration} | set(SCALES) == set(TABLE)
 
 
 def test_every_variable_belongs_to_a_sensor_that_names_it():
-    sensors = instruments(Config())
+    clocks = every_instrument(True)
+    sensors = every_instrument(False)
     for name, variable in TABLE.items():
         assert variable.sensors
         for sensor in set(variable.sensors) - {"imu"}:
-            assert name in sensors[sensor].calibration
+            assert name in (*sensors[sensor].calibration, *clocks[sensor].calibration)
 
 
 def test_the_manual_says_of_every_variable_what_it_is_and_what_shows_it():

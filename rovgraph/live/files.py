@@ -40,12 +40,12 @@ from rovgraph.inference.error_state import REINITIALISE_AT_S
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.live.message import PLACED, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Event
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, read_log
-from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, VERSION_COLUMN, all_columns
+from rovgraph.log.streams import RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
 
 VERSION = 7
@@ -251,7 +251,7 @@ class Recorder:
         self._unsynced = False
         self._stop = threading.Event()
         names = recorded_columns()
-        columns = {**STREAMS, GEODETIC: (*LAT_LON, "fix_sd"), "thruster": THRUSTERS}
+        columns = {**STREAMS, **PLACED, "thruster": THRUSTERS}
         self._places = {sensor: tuple(map(names.index, of_sensor)) for sensor, of_sensor in columns.items()}
         self._width = len(names)
         self._file = _opened(self.path, (",".join(names) + "\n").encode())
@@ -623,7 +623,8 @@ def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
     if len(header) + len(rows) < path.stat().st_size:
         rows = rows[rows.index(b"\n") + 1 :]
     frame = pd.read_csv(io.BytesIO(header + rows[: rows.rfind(b"\n") + 1]))
-    if origin is not None and frame["fix_lat"].notna().any():
-        lat, lon = frame.pop("fix_lat").to_numpy(float), frame.pop("fix_lon").to_numpy(float)
-        frame["fix_north"], frame["fix_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+    for of in ("fix", "ship"):
+        if origin is not None and f"{of}_lat" in frame and frame[f"{of}_lat"].notna().any():
+            lat, lon = (frame.pop(f"{of}_{name}").to_numpy(float) for name in ("lat", "lon"))
+            frame[f"{of}_north"], frame[f"{of}_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
     return frame

@@ -18,16 +18,17 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
-from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.live.message import GEODETIC, PLACED, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, precedence
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, Mag
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.instruments import instruments
 
-_STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
+_STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
 
@@ -84,7 +85,7 @@ class Intake:
         self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out
-        self._newest: dict[str, float] = {}
+        self._newest: dict[tuple[str | float, ...], float] = {}  # by sensor, and beacon or place
         self.news: list[tuple[str, str]] = []
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
@@ -101,11 +102,11 @@ class Intake:
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard at that time."""
         sensor, values = reading
-        if sensor == GEODETIC:
+        if sensor in PLACED:
             if self.origin is None:
                 self.origin = float(values[0]), float(values[1])
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
-            sensor, values = "fix", np.array([north, east, values[2]])
+            sensor, values = _STREAM[sensor], np.array([north, east, values[2]])
         elif sensor == "fix":
             self._local = True
         elif sensor == "mag":
@@ -114,12 +115,18 @@ class Intake:
         if size != self._sizes.setdefault(sensor, size):
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
-        newest = self._newest.get(sensor, -np.inf)
+        of = sensor, *(value for value, label in zip(values.tolist(), self._labels(sensor), strict=False) if label)
+        newest = self._newest.get(of, -np.inf)
         if abs(time - newest) < SPACING_S:
             self._left_out[sensor, "at the time of another"] += 1
             return None
-        self._newest[sensor] = max(time, newest)
+        self._newest[of] = max(time, newest)
         return Measurement(time, sensor, self._with_known_sd(sensor, values), 0)
+
+    @staticmethod
+    def _labels(sensor: str) -> tuple[bool, ...]:
+        """Which of a sensor's columns are names."""
+        return tuple(column.label for column in SENSORS[sensor].columns) if sensor in SENSORS else ()
 
     def _with_known_sd(self, sensor: str, values: Array) -> Array:
         """The values of a measurement; its own sd is NaN where it is a placeholder, as most of that sensor are."""
@@ -228,6 +235,8 @@ class Startup:
         self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]
+        stated = self.config.model_fields_set
+        later = [s for s in later if s.name not in ACOUSTICS or s.name in stated]
         expected = {s.name for s in later if s.heading_source is None or named}
         log = gathered(self.measurements, "so far", origin)
         try:

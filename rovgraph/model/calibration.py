@@ -463,11 +463,11 @@ TABLE: dict[str, Variable] = {
                 estimate=True,
             )
             for name, letter, sd, more, shown in (
-                ("roll", "B", 1.0, "", "depths from a pressure sensor, with the vehicle to port and to starboard"),
-                ("pitch", "E", 1.0, "", "depths from a pressure sensor, with the vehicle ahead and astern"),
+                ("roll", '"', 1.0, "", "depths from a pressure sensor, with the vehicle to port and to starboard"),
+                ("pitch", "'", 1.0, "", "depths from a pressure sensor, with the vehicle ahead and astern"),
                 (
                     "yaw",
-                    "G",
+                    "=",
                     3.0,
                     ", and the ship's compass with it",
                     "a track beside the ship that a compass or position fixes orient; far from below it",
@@ -476,7 +476,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "usbl_arm",
-            "H",
+            ">",
             _XYZ,
             "m",
             0.3,
@@ -487,7 +487,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "sound_speed_scale",
-            "I",
+            "?",
             _ONE,
             "1",
             0.01,
@@ -498,7 +498,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "usbl_range_offset",
-            "J",
+            "@",
             _ONE,
             "m",
             0.1,
@@ -509,7 +509,7 @@ TABLE: dict[str, Variable] = {
         ),
         _time_offset(
             "usbl",
-            "K",
+            "[",
             0.5,
             ("usbl",),
             "the stamps of acoustic positions are",
@@ -517,7 +517,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "usbl_direction_error",
-            "L",
+            "\\",
             ("_across", "_up"),
             "rad",
             0.3 * _DEG,
@@ -528,7 +528,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "usbl_range_error",
-            "N",
+            "]",
             _ONE,
             "m",
             0.5,
@@ -539,7 +539,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "range_offset",
-            "O",
+            "^",
             _ONE,
             "m",
             0.1,
@@ -550,7 +550,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "range_clock",
-            "P",
+            "_",
             _ONE,
             "m",
             1e4,  # 7 s of sound
@@ -561,7 +561,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "range_clock_drift",
-            "Q",
+            "`",
             _ONE,
             "m/s",
             0.02,  # 13 ppm of a quartz, at 1500 m/s
@@ -572,7 +572,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "range_error",
-            "R",
+            "{",
             _ONE,
             "m",
             0.5,
@@ -582,7 +582,7 @@ TABLE: dict[str, Variable] = {
             time_constant=60.0,
         ),
         _time_offset(
-            "range", "S", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"
+            "range", "|", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"
         ),
         *(variable for k in range(BEACONS) for variable in _beacon(k)),
     )

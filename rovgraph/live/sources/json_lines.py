@@ -12,7 +12,7 @@ import pandas as pd
 from rovgraph.dates import seconds_of_texts
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.live.message import GEODETIC, Message, readings
+from rovgraph.live.message import PLACED, Message, readings
 from rovgraph.live.sources.doppler import report_message
 from rovgraph.live.sources.source import LineDecoder, Notify
 from rovgraph.log.latitudes import is_placeholder
@@ -28,7 +28,8 @@ ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
 UNKNOWN = 20  # unknown keys that are counted separately
 
 _AS_IT_IS = Scale()
-_OTHERS = dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
+_OTHERS = {name: sensor for sensor, columns in PLACED.items() for name in columns[:2]}
+_OTHERS |= {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
 
 
 def json_lines(url: str, notify: Notify, config: Config) -> LineDecoder:
