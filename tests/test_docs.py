@@ -34,6 +34,7 @@ PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 ELSEWHERE = (  # what is not run here: instruments, a browser, recordings that do not come with rovgraph, hours of work
     *("waterlinked://", "SOURCE...", "--http", "dive.BIN", "dive.mtb", "remus600", "ictineu", "misalignment.yaml"),
     "rovgraph demo",  # test_api and test_packaging run it
+    "--pdf",  # needs a browser; test_pages runs it with one that is made up
 )
 PATHS = ("bluerov2", "survey", "auv", "bag")  # pages whose commands test_paths runs, as they stand
 INSTRUMENTS = ("waterlinked://",)  # in what it does not run
