@@ -16,6 +16,7 @@ import ast
 import inspect
 import multiprocessing
 import re
+import resource
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -756,17 +757,22 @@ def resident(key: str) -> float:
     return float(found[1]) / 1024.0 if found else np.nan
 
 
-def in_a_process(task: Task, method: str) -> dict[str, Score]:
-    """`by_method` in a process that begins with the log and with what was compiled."""
+def in_a_process(task: Task, method: str, limit: float) -> dict[str, Score]:
+    """`by_method` in a process that begins with the log and with what was compiled; empty where it takes too long."""
     fork = multiprocessing.get_context("fork")
     ours, theirs = fork.Pipe(duplex=False)
-    process = fork.Process(target=lambda: theirs.send(by_method(task, method)))
+
+    def work() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(60.0 * limit), int(60.0 * limit)))
+        theirs.send(by_method(task, method))
+
+    process = fork.Process(target=work)
     process.start()
     theirs.close()
     try:
         return ours.recv()
     except EOFError:
-        return {}  # it has said why
+        return {}
     finally:
         process.join()
 
@@ -780,6 +786,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of lawnmower")
     every = ["rovgraph", *PEERS]
     parser.add_argument("--methods", nargs="+", choices=every, default=every, metavar="METHOD", help=", ".join(every))
+    parser.add_argument("--limit", type=float, default=30.0, help="processor time of a method on a dive [min]")
     parser.add_argument("--ictineu", type=Path, default=ROOT.parent / "shared" / "data" / "ictineu", metavar="FOLDER")
     given = parser.parse_args()
     if unknown := set(given.dives) - set(dives):
@@ -802,14 +809,19 @@ def main() -> None:
             "ictineu": lambda _: ictineu(given.ictineu),
         }
         tasks = makers[dive](seeds) if dive in makers else campaign(dive, seeds)
-        name, scores = dive, dict[str, list[Score]]()
+        name, scores, given_up = dive, dict[str, list[Score]](), set[str]()
         for task in tasks:
             name = task.name
-            for method in methods:
-                for shown, one in in_a_process(task, method).items():
+            for method in (method for method in methods if method not in given_up):
+                found = in_a_process(task, method, given.limit)
+                given_up |= set() if found else {method}
+                for shown, one in found.items():
                     scores.setdefault(shown, []).append(one)
-        for method, rows in scores.items():
+        for method, rows in ((m, rows) for m, rows in scores.items() if m not in given_up):
             print(f"| {name} | {method} | {row(rows)} | {lines_of(method)} |", flush=True)
+        for method in given_up:
+            late = f"given up after {given.limit:g} min"
+            print(f"| {name} | {method} | – | – | – | – | {late} | – | {lines_of(method)} |", flush=True)
 
 
 def warm_up() -> None:
