@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from browsers import PRINTS, printing_browser
 
 import rovgraph as rg
 from rovgraph.api.reporting import report
@@ -88,21 +89,10 @@ def cut(path):
 
 @pytest.fixture
 def browser(tmp_path, monkeypatch):
-    """A program that prints as Chromium does, alone on PATH; it keeps what it was called with beside it."""
+    """Puts a program that prints as Chromium does on PATH, alone."""
 
-    def install(does="pathlib.Path(out).write_bytes(b'%PDF-1.4 of ' + sys.argv[-1].encode())", name="chromium"):
-        program = tmp_path / "bin" / name
-        program.parent.mkdir(exist_ok=True)
-        lines = [
-            f"#!{sys.executable}",
-            "import pathlib, sys",
-            "pathlib.Path(__file__ + '.called').write_text(' '.join(sys.argv[1:]))",
-            "out = next(word.partition('=')[2] for word in sys.argv if word.startswith('--print-to-pdf='))",
-            does,
-        ]
-        program.write_text("\n".join(lines))
-        program.chmod(0o755)
-        return program
+    def install(does=PRINTS, name="chromium"):
+        return printing_browser(tmp_path / "bin" / name, does)
 
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("ROVGRAPH_BROWSER", raising=False)
