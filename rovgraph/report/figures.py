@@ -684,7 +684,7 @@ class Plot:
         """sd of the horizontal position along its worst direction [m]."""
 
         def worst(track: Trajectory) -> Array:
-            known = np.isfinite(track.cov_p).all(axis=(1, 2))
+            known = np.asarray(np.isfinite(track.cov_p).all(axis=(1, 2)))
             major = ellipse_axes(np.where(known[:, None, None], track.cov_p, 0.0))[0]
             return np.where(known, major / np.sqrt(CHI2_99), np.nan)
 
