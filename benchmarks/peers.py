@@ -1,4 +1,4 @@
-"""Beside what people would write: dead reckoning, a plain GTSAM batch and pyins, on the same dives.
+"""Beside what people would write: dead reckoning, plain GTSAM as a batch and by iSAM2, and pyins, on the same dives.
 
     python benchmarks/peers.py                                  falcon, lawnmower, three grades, Ictineu
     python benchmarks/peers.py lawnmower --seeds 5 8            one of them, with its first and last seed
@@ -6,14 +6,20 @@
     python benchmarks/peers.py ictineu --ictineu FOLDER         a folder with log.csv.gz, reference.csv.gz, ictineu.yaml
 
 pyins is `pip install python-ins` (or 'rovgraph[benchmarks]'), and left out where it is absent. All get the same
-measurements (`Measured`), prepared as a person would, and the noise that the configuration states. Nothing is
-asserted: it prints a table. Figures are in benchmarks/README.md.
+measurements (`Measured`), prepared as a person would, and the noise that the configuration states. Each method runs in
+a process of its own, so that its memory can be told. Nothing is asserted: it prints a table. Figures are in
+docs/peers.md.
 """
 
 import argparse
+import ast
+import inspect
+import multiprocessing
+import re
+import resource
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
@@ -46,6 +52,7 @@ HUBER = 1.345
 LEG_S = 30.0  # for which a compass errs in the same way
 INTEGRATION = 1e-6  # covariance that GTSAM's preintegration needs
 STEPS, ENOUGH = 15, 1e-4  # Gauss-Newton steps at most, and the largest change of the last [rad, m, m/s]
+RELINEARISE, RELINEARISE_EVERY = 0.1, 10  # GTSAM's own: threshold [rad, m, m/s], and updates between two looks
 COVARIANCE_S = 1.0  # between keyframes whose covariance is taken
 FIRST_SD_MPS = 1.0  # of the velocity at the first ping
 
@@ -260,7 +267,7 @@ class Graph:
         self.values = gtsam.Values()
         self._begin()
         for k in range(1, self.count):
-            self._move(k)
+            self.native.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), self._moved(k)))
 
     def _begin(self) -> None:
         """Priors, and dead reckoning as the first values."""
@@ -306,7 +313,8 @@ class Graph:
         t = self.given.imu[0]
         return np.concatenate([[-np.inf], 0.5 * (t[1:] + t[:-1]), [np.inf]])
 
-    def _move(self, k: int) -> None:
+    def _moved(self, k: int) -> Any:
+        """The IMU's motion to a ping from the one before."""
         _, force, rate = self.given.imu
         begin, end = self.given.pings[0][k - 1 : k + 1]
         first, last = np.searchsorted(self._edges, [begin, end], "right") - 1
@@ -315,7 +323,7 @@ class Graph:
         for j, dt in zip(range(first, last + 1), np.diff(bounds).tolist(), strict=True):
             if dt > 0.0:
                 moved.integrateMeasurement(force[j], rate[j], dt)
-        self.native.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), moved))
+        return moved
 
     def solve(self) -> Trajectory:
         """Gauss-Newton, then covariances about a second apart."""
@@ -328,7 +336,10 @@ class Graph:
         linear = self._linear()
         last = [M] if self.misaligned else []
         ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
-        tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        return self._track(linear.eliminateMultifrontal(ordering, gtsam.EliminateQR))
+
+    def _track(self, tree: Any) -> Trajectory:
+        """The values, with covariances about a second apart from what has eliminated them."""
         t, taken = self.given.pings[0], [0]
         for k in range(1, self.count):
             if t[k] - t[taken[-1]] >= COVARIANCE_S:
@@ -348,30 +359,34 @@ class Graph:
 
     def _linear(self) -> gtsam.GaussianFactorGraph:
         """All factors at the values; Huber losses are weights."""
-        given, n = self.given, self.count
-        R, p, v, bias = self._states()
         m = self.values.atVector(M)[0] if self.misaligned else 0.0
-        blocks = [self._pings(R, v, bias, m)]
-        blocks += [self._headings(R, heading, sd) for heading, sd in given.headings]
-        if given.depth is not None:
-            arm, sd = given.arm("depth"), given.config.depth.sd_m
-            H = np.concatenate([-(R @ skew(arm))[:, 2:], R[:, 2:], np.zeros((n, 1, 10))], axis=2)
-            blocks.append(huber((given.depth - p[:, 2] - (R @ arm)[:, 2])[:, None] / sd, H / sd))
-        if len(given.fixes[0]):
-            blocks.append(self._fixes(R, p, v))
-        r, H = (np.concatenate([block[k] for block in blocks], axis=1) for k in (0, 1))
+        r, H = self._rows(slice(None), *self._states(), m)
         linear, unit = self.native.linearize(self.values), gtsam.noiseModel.Unit.Create(r.shape[1])
-        for k in range(n):
+        for k in range(self.count):
             terms = [(X(k), H[k, :, :6]), (V(k), H[k, :, 6:9]), (B(k), H[k, :, 9:15])]
             terms += [(M, H[k, :, 15:])] if self.misaligned else []
             # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
             linear.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
         return linear
 
-    def _pings(self, R: Array, v: Array, bias: Array, m: float) -> tuple[Array, Array]:
+    def _rows(self, some: slice, R: Array, p: Array, v: Array, bias: Array, m: float) -> tuple[Array, Array]:
+        """Residuals and Jacobians, shape (n, rows) and (n, rows, 16), of some pings and what belongs to them."""
+        given = self.given
+        blocks = [self._pings(some, R, v, bias, m)]
+        blocks += [self._headings(R, heading[some], sd) for heading, sd in given.headings]
+        if given.depth is not None:
+            arm, sd = given.arm("depth"), given.config.depth.sd_m
+            H = np.concatenate([-(R @ skew(arm))[:, 2:], R[:, 2:], np.zeros((len(R), 1, 10))], axis=2)
+            blocks.append(huber((given.depth[some] - p[:, 2] - (R @ arm)[:, 2])[:, None] / sd, H / sd))
+        if len(given.fixes[0]):
+            blocks.append(self._fixes(some, R, p, v))
+        r, H = (np.concatenate([block[k] for block in blocks], axis=1) for k in (0, 1))
+        return r, H
+
+    def _pings(self, some: slice, R: Array, v: Array, bias: Array, m: float) -> tuple[Array, Array]:
         """The velocity at the DVL's arm, turned by the misalignment."""
-        _, measured, root = self.given.pings
-        arm, rate = self.given.arm("dvl"), self.given.rate
+        measured, root = self.given.pings[1][some], self.given.pings[2]
+        arm, rate = self.given.arm("dvl"), self.given.rate[some]
         own = np.einsum("nji,nj->ni", R, v)
         at_arm = own + np.cross(rate - bias, arm)
         turn = matrix_from_rpy([0.0, 0.0, -m])
@@ -389,16 +404,83 @@ class Graph:
         off = wrap_angle(heading - np.arctan2(R[:, 1, 0], R[:, 0, 0]))
         return huber(off[:, None] / sd, H / sd)
 
-    def _fixes(self, R: Array, p: Array, v: Array) -> tuple[Array, Array]:
-        """The last fix that is nearest to a ping."""
-        k, since, measured = self.given.fixes
+    @cached_property
+    def _fix_of(self) -> Array:
+        """The last fix that is nearest to a ping, -1 = none, shape (n,)."""
+        found = np.full(self.count, -1)
+        found[self.given.fixes[0]] = np.arange(len(self.given.fixes[0]))
+        return found
+
+    def _fixes(self, some: slice, R: Array, p: Array, v: Array) -> tuple[Array, Array]:
+        fix = self._fix_of[some]
+        k = np.flatnonzero(fix >= 0)
+        since, measured = (values[fix[k]] for values in self.given.fixes[1:])
         arm, sd = self.given.arm("fix"), self.given.config.fix.sd_m
-        r, H = np.zeros((self.count, 2)), np.zeros((self.count, 2, 16))
+        r, H = np.zeros((len(fix), 2)), np.zeros((len(fix), 2, 16))
         expected = p[k] + R[k] @ arm + since[:, None] * v[k]
         r[k] = (measured - expected[:, :2]) / sd
         H[k, :, :3], H[k, :, 3:6] = -(R[k] @ skew(arm))[:, :2] / sd, R[k][:, :2] / sd
         H[k, :, 6:9] = since[:, None, None] * np.eye(3)[:2] / sd
         return huber(r, H)
+
+
+class Incremental(Graph):
+    """The same graph by iSAM2, a ping at a time, each begun where the IMU predicts it; one Python factor a ping."""
+
+    def __init__(self, given: Measured, misaligned: bool) -> None:
+        super().__init__(given, misaligned)
+        params = gtsam.ISAM2Params()
+        params.setRelinearizeThreshold(RELINEARISE)
+        params.relinearizeSkip = RELINEARISE_EVERY
+        params.setFactorization("QR")
+        self.isam = gtsam.ISAM2(params)
+
+    def solve(self) -> Trajectory:
+        """The track after the last ping."""
+        native = [self.native.at(i) for i in range(self.native.size())]
+        priors = len(native) - (self.count - 1)
+        for k in range(self.count):
+            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            if k:
+                graph.add(native[priors + k - 1])
+                self._predict(k, values)
+            else:
+                for factor in native[:priors]:
+                    graph.add(factor)
+                for key, insert in ((X(0), "Pose3"), (V(0), "Vector"), (B(0), "ConstantBias")):
+                    values.insert(key, getattr(self.values, f"at{insert}")(key))
+                if self.misaligned:
+                    values.insert(M, np.zeros(1))
+            graph.add(self._factor(k))
+            self.isam.update(graph, values)
+        self.values = self.isam.calculateBestEstimate()
+        return self._track(self.isam)
+
+    def _predict(self, k: int, values: gtsam.Values) -> None:
+        pose, v = self.isam.calculateEstimatePose3(X(k - 1)), self.isam.calculateEstimateVector(V(k - 1))
+        bias = self.isam.calculateEstimateConstantBias(B(k - 1))
+        state = self._moved(k).predict(gtsam.NavState(pose, v), bias)
+        values.insert(X(k), state.pose())
+        values.insert(V(k), state.velocity())
+        values.insert(B(k), bias)
+
+    def _factor(self, k: int) -> gtsam.CustomFactor:
+        """All that was measured at a ping."""
+        keys, parts = [X(k), V(k), B(k)], [slice(6), slice(6, 9), slice(9, 15)]
+        if self.misaligned:
+            keys, parts = [*keys, M], [*parts, slice(15, 16)]
+
+        def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+            pose, bias = values.atPose3(keys[0]), values.atConstantBias(keys[2]).gyroscope()
+            m = values.atVector(M)[0] if self.misaligned else 0.0
+            R, p, v = pose.rotation().matrix()[None], pose.translation()[None], values.atVector(keys[1])[None]
+            r, J = self._rows(slice(k, k + 1), R, p, v, bias[None], m)
+            for i, part in enumerate(parts if H is not None else ()):
+                H[i] = np.asfortranarray(J[0, :, part])
+            return -r[0]
+
+        rows = 3 + len(self.given.headings) + (self.given.depth is not None) + 2 * bool(len(self.given.fixes[0]))
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), keys, error)
 
 
 X, V, B = (lambda k, letter=letter: gtsam.symbol(letter, k) for letter in "xvb")
@@ -598,44 +680,101 @@ def span(seeds: range) -> str:
 
 @dataclass(frozen=True)
 class Score:
-    """Of one method on one dive: horizontal rms error [m], NEES per degree of freedom, processor time [s]."""
+    """Of one method on one dive.
+
+    Attributes
+    ----------
+    rms, end : horizontal errors [m]
+    nees : per degree of freedom
+    seconds : processor time
+    megabytes : the most memory beyond what the log takes
+    """
 
     rms: float
+    end: float
     nees: float
     seconds: float
+    megabytes: float
 
 
-def score(task: Task, track: Trajectory, seconds: float) -> Score:
-    metrics = evaluate(track, task.truth, task.after)
-    return Score(metrics.rms_m, np.nan if metrics.nees is None else 0.5 * metrics.nees, seconds)
-
-
-def ours(task: Task) -> Iterator[tuple[str, Score]]:
+def ours(task: Task) -> dict[str, Trajectory]:
     """Both estimates of `rovgraph smooth`, which are made together."""
-    began = time.process_time()
     estimates = smooth(task.log, task.config, "both").estimates
-    seconds = time.process_time() - began
-    for estimate in estimates:
-        if estimate.kind in ("smoothed", "filtered"):
-            yield f"rovgraph, {estimate.kind}", score(task, estimate.trajectory, seconds)
+    return {f"rovgraph, {e.kind}": e.trajectory for e in estimates if e.kind in ("smoothed", "filtered")}
 
 
 PEERS: dict[str, Callable[[Measured, Task], Trajectory]] = {
     "dead reckoning": lambda given, task: dead_reckoning(given),
     "plain GTSAM": lambda given, task: Graph(given, misaligned=False).solve(),
     "plain GTSAM with misalignment": lambda given, task: Graph(given, misaligned=True).solve(),
+    "GTSAM's iSAM2 with misalignment": lambda given, task: Incremental(given, misaligned=True).solve(),
     "pyins": lambda given, task: pyins_filter(given, task.turning_earth),
+}
+OURS = 3  # lines: read the configuration, read the log, smooth
+DEAD_RECKONING = (Measured, dead_reckoning)
+WRITTEN: dict[str, tuple[Callable[..., Any], ...]] = {  # what somebody who has the log has to write
+    "dead reckoning": DEAD_RECKONING,
+    "plain GTSAM": (*DEAD_RECKONING, Graph, huber),
+    "plain GTSAM with misalignment": (*DEAD_RECKONING, Graph, huber),
+    "GTSAM's iSAM2 with misalignment": (*DEAD_RECKONING, Graph, huber, Incremental),
+    "pyins": (
+        *(*DEAD_RECKONING, Observation, PingMatrices, HeadingMatrices, PlaceMatrices),
+        *(numbers, attitude_of, pyins_measurements, pyins_filter),
+    ),
 }
 
 
-def by_peers(task: Task, methods: Sequence[str]) -> Iterator[tuple[str, Score]]:
-    """Some methods on a dive, by their names in the table."""
-    if "rovgraph" in methods:
-        yield from ours(task)
-    for name in (name for name in PEERS if name in methods):
-        began = time.process_time()
-        track = PEERS[name](Measured(task.config, task.log), task)
-        yield name, score(task, track, time.process_time() - began)
+def lines_of(method: str) -> int:
+    """Lines to write for a method, without comments, docstrings and empty lines."""
+    if method not in WRITTEN:
+        return OURS
+    count = 0
+    for written in WRITTEN[method]:
+        tree = ast.parse(inspect.getsource(written))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+                del node.body[0]
+        count += sum(bool(line.strip()) for line in ast.unparse(tree).splitlines())
+    return count
+
+
+def by_method(task: Task, method: str) -> dict[str, Score]:
+    """A method on a dive, in this process: the scores of its rows."""
+    began, before = time.process_time(), resident("VmRSS")
+    tracks = ours(task) if method == "rovgraph" else {method: PEERS[method](Measured(task.config, task.log), task)}
+    seconds, megabytes = time.process_time() - began, resident("VmHWM") - before
+    scores = {}
+    for name, track in tracks.items():
+        metrics = evaluate(track, task.truth, task.after)
+        nees = np.nan if metrics.nees is None else 0.5 * metrics.nees
+        scores[name] = Score(metrics.rms_m, metrics.end_m, nees, seconds, megabytes)
+    return scores
+
+
+def resident(key: str) -> float:
+    """Memory of this process now (VmRSS) or at most (VmHWM) [MB]."""
+    found = re.search(rf"{key}:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return float(found[1]) / 1024.0 if found else np.nan
+
+
+def in_a_process(task: Task, method: str, limit: float) -> dict[str, Score]:
+    """`by_method` in a process that begins with the log and with what was compiled; empty where it takes too long."""
+    fork = multiprocessing.get_context("fork")
+    ours, theirs = fork.Pipe(duplex=False)
+
+    def work() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(60.0 * limit), int(60.0 * limit)))
+        theirs.send(by_method(task, method))
+
+    process = fork.Process(target=work)
+    process.start()
+    theirs.close()
+    try:
+        return ours.recv()
+    except EOFError:
+        return {}
+    finally:
+        process.join()
 
 
 def main() -> None:
@@ -647,6 +786,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of lawnmower")
     every = ["rovgraph", *PEERS]
     parser.add_argument("--methods", nargs="+", choices=every, default=every, metavar="METHOD", help=", ".join(every))
+    parser.add_argument("--limit", type=float, default=30.0, help="processor time of a method on a dive [min]")
     parser.add_argument("--ictineu", type=Path, default=ROOT.parent / "shared" / "data" / "ictineu", metavar="FOLDER")
     given = parser.parse_args()
     if unknown := set(given.dives) - set(dives):
@@ -656,10 +796,12 @@ def main() -> None:
     if len(methods) < len(given.methods):
         print("pyins is left out: pip install python-ins\n")
     seeds = range(given.seeds[0], given.seeds[1] + 1)
-    print("| dive | method | rms [m] | median | NEES | processor time a dive |\n|---|---|---|---|---|---|")
+    print("| dive | method | rms [m] | median | end | NEES | processor time | memory | lines to write |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    warm_up()
     for dive in given.dives or dives:
         if dive == "ictineu" and not (given.ictineu / "log.csv.gz").is_file():
-            print(f"| Ictineu | absent: {given.ictineu}; name it with --ictineu | | | | |")
+            print(f"| Ictineu | absent: {given.ictineu}; name it with --ictineu | | | | | | | |")
             continue
         makers = {
             "falcon": falcon,
@@ -667,20 +809,34 @@ def main() -> None:
             "ictineu": lambda _: ictineu(given.ictineu),
         }
         tasks = makers[dive](seeds) if dive in makers else campaign(dive, seeds)
-        name, scores = dive, dict[str, list[Score]]()
+        name, scores, given_up = dive, dict[str, list[Score]](), set[str]()
         for task in tasks:
             name = task.name
-            for method, one in by_peers(task, methods):
-                scores.setdefault(method, []).append(one)
-        for method, rows in scores.items():
-            print(f"| {name} | {method} | {row(rows)} |", flush=True)
+            for method in (method for method in methods if method not in given_up):
+                found = in_a_process(task, method, given.limit)
+                given_up |= set() if found else {method}
+                for shown, one in found.items():
+                    scores.setdefault(shown, []).append(one)
+        for method, rows in ((m, rows) for m, rows in scores.items() if m not in given_up):
+            print(f"| {name} | {method} | {row(rows)} | {lines_of(method)} |", flush=True)
+        for method in given_up:
+            late = f"given up after {given.limit:g} min"
+            print(f"| {name} | {method} | – | – | – | – | {late} | – | {lines_of(method)} |", flush=True)
+
+
+def warm_up() -> None:
+    """Compiles what later processes have from this one."""
+    dive, config = simulated("lawnmower", 1, choices=Choices(duration=60.0))
+    smooth(Log.from_frame(dive.log_frame, config), config, "both")
 
 
 def row(scores: list[Score]) -> str:
-    """Root of the mean square error, its median, mean NEES and mean time."""
-    rms, nees, seconds = (np.array([getattr(one, part) for one in scores]) for part in ("rms", "nees", "seconds"))
+    """Root of the mean square error, its median, that of the end, mean NEES, time and memory."""
+    parts = ("rms", "end", "nees", "seconds", "megabytes")
+    rms, end, nees, seconds, megabytes = (np.array([getattr(one, part) for one in scores]) for part in parts)
     honest = "–" if np.isnan(nees).all() else f"{np.nanmean(nees):.2f}"
-    return f"{np.sqrt(np.mean(rms**2)):.2f} | {np.median(rms):.2f} | {honest} | {seconds.mean():.1f} s"
+    errors = f"{np.sqrt(np.mean(rms**2)):.2f} | {np.median(rms):.2f} | {np.sqrt(np.mean(end**2)):.2f}"
+    return f"{errors} | {honest} | {seconds.mean():.1f} s | {megabytes.mean():.0f} MB"
 
 
 if __name__ == "__main__":

@@ -1,10 +1,13 @@
-"""A headless browser for pages, where one is found."""
+"""A headless browser for pages, where one is found, and a program that only prints as one does."""
 
 import contextlib
 import shutil
+import sys
+from pathlib import Path
 
 import pytest
 
+PRINTS = "pathlib.Path(out).write_bytes(b'%PDF-1.4 of ' + sys.argv[-1].encode())"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
 
 
@@ -20,3 +23,18 @@ def chromium():
             pytest.skip("no browser was found: no page was opened; playwright install chromium-headless-shell gets one")
         yield browser
         browser.close()
+
+
+def printing_browser(program: Path, does: str = PRINTS) -> Path:
+    """A program that is called as Chromium is to print; it keeps the words of its call beside it."""
+    program.parent.mkdir(exist_ok=True)
+    lines = [
+        f"#!{sys.executable}",
+        "import pathlib, sys",
+        "pathlib.Path(__file__ + '.called').write_text(' '.join(sys.argv[1:]))",
+        "out = next(word.partition('=')[2] for word in sys.argv if word.startswith('--print-to-pdf='))",
+        does,
+    ]
+    program.write_text("\n".join(lines))
+    program.chmod(0o755)
+    return program

@@ -442,6 +442,55 @@ def test_what_a_notebook_shows_of_a_dive_is_one_line(result):
     assert "dvl " in repr(result.log) and result.verdict in repr(result)
 
 
+QUANTITIES = ("track", "depth", "heading", "roll", "pitch", "speed", "sd", "heading_sd")
+
+
+def test_quantities_are_drawn_on_axes_that_are_given(result):
+    from matplotlib.figure import Figure
+
+    track, minutes = result.smoothed.trajectory, {}
+    for name, axes in zip(QUANTITIES, Figure().subplots(len(QUANTITIES), 1), strict=True):
+        assert getattr(result.plot, name)(axes) is axes
+        line = next(line for line in axes.lines if line.get_label() == "smoothed")
+        minutes[name] = (line.get_xdata(), line.get_ydata(), axes)
+    np.testing.assert_array_equal(minutes["track"][0], track.p_n[:, 1])
+    for name, value in (
+        ("depth", track.p_n[:, 2]),
+        ("roll", np.rad2deg(track.rpy[:, 0])),
+        ("pitch", np.rad2deg(track.rpy[:, 1])),
+        ("speed", np.hypot(*track.v_n[:, :2].T)),
+        ("sd", np.sqrt(np.linalg.eigvalsh(track.cov_p[:, :2, :2])[:, 1])),
+        ("heading_sd", np.rad2deg(track.rpy_sd[:, 2])),
+    ):
+        np.testing.assert_allclose(minutes[name][0], track.time - track.time[0])
+        np.testing.assert_allclose(minutes[name][1], value, atol=1e-12)
+    assert minutes["depth"][2].yaxis_inverted() and minutes["sd"][2].get_ylim()[0] == 0.0
+    assert minutes["heading"][2].get_xlabel() == "time since start [s]"
+
+
+def test_several_estimates_are_drawn_together_and_new_axes_are_pyplots(result):
+    from matplotlib import pyplot
+
+    before = dict(pyplot.rcParams)
+    axes = result.plot.speed(None, "smoothed", "filtered")
+    try:
+        assert [line.get_label() for line in axes.lines] == ["smoothed", "filtered"]
+        assert pyplot.fignum_exists(axes.figure.number) and dict(pyplot.rcParams) == before
+    finally:
+        pyplot.close(axes.figure)
+
+
+def test_what_cannot_be_drawn_is_one_line(result):
+    bare = replace(result, log=replace(result.log, streams={"imu": result.log["imu"]}))
+    for use, said in (
+        (lambda: result.plot.depth("filtered"), "axes: expected matplotlib's Axes or None, found a str; estimates"),
+        (lambda: result.plot.depth(None, "best"), "the best estimate was not requested; the result has smoothed"),
+        (lambda: bare.plot.altitude(), "no altitude to draw; the log has no dvl_altitude"),
+    ):
+        with pytest.raises(rg.InputError, match=said):
+            use()
+
+
 def test_progress_is_told(short, config):
     told: list[tuple[str, float]] = []
     log = rg.Log.from_frame(short[short["time"] < short["time"].iloc[0] + 20.0], config)

@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from browsers import printing_browser
 from ruamel.yaml import YAML
 from test_microstrain_files import as_export as microstrain_export
 from test_vectornav_files import as_csv as vectornav_csv
@@ -102,6 +103,19 @@ def test_every_page_stands_in_the_navigation():
     assert {page.name for page in PAGES[1:]} | {"tutorial.py"} <= set(listed)
 
 
+def test_every_picture_of_the_manuals_is_there_and_small():
+    pictures = [
+        page.parent / src
+        for page in PAGES
+        for src in re.findall(r"(?:!\[[^\]]*\]\(|<img [^>]*src=\")([^)\"\s]+)", page.read_text(encoding="utf-8"))
+        if "://" not in src
+    ]
+    assert len(pictures) > 10
+    assert [path.name for path in pictures if not path.is_file()] == []
+    assert [path.name for path in (DOCS / "images").iterdir() if path not in set(pictures)] == []
+    assert [path.name for path in pictures if path.stat().st_size > 150_000] == []
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_its_search_needs_no_network(tmp_path):
     """Links, anchors, public names without a docstring, and the notebook, which is run."""
@@ -117,6 +131,9 @@ def test_the_site_is_built_without_a_warning_and_its_search_needs_no_network(tmp
             r"<(?:script|link|img)[^>]+(?:src|href)=\"(https?:[^\"]+)", html.read_text(encoding="utf-8")
         )
         assert not loaded, html.name
+        if html.name != "404.html":  # its addresses begin at the root of a server
+            own = re.findall(r"<(?:img|script)[^>]+src=\"(?!data:)([^\"]+)", html.read_text(encoding="utf-8"))
+            assert [src for src in own if not (html.parent / src).is_file()] == [], html.name
     assert "rg.Online" in (tmp_path / "site" / "api-reference.html").read_text(encoding="utf-8")
 
 
@@ -222,6 +239,7 @@ def test_the_commands_of_a_page_do_their_work_one_after_another(page, folder, tm
     shutil.copytree(folder, here)
     monkeypatch.chdir(here)
     monkeypatch.setattr("rovgraph.lab.plan.cores", lambda: 1)  # each process imports everything again
+    monkeypatch.setenv("ROVGRAPH_BROWSER", str(printing_browser(tmp_path / "chromium")))
     for text in map(shortened, RUN[page]):
         words = shlex.split(text)
         for k, word in enumerate(words):

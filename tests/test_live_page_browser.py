@@ -78,6 +78,10 @@ def test_home_depth_and_heading_of_a_dive(browser, dive):
     assert "140.7 m" in home and "225°" in home
     assert "0:16:35" in page.inner_text("#times")
     assert page.evaluate("rovgraph.map.track.since(995 - 600).length") == 121
+    assert "bottom" not in page.inner_text(".gauge.depth")
+    dive[0].send(solution(1000.0, 100.0, altitude=4.0))
+    page.wait_for_function("rovgraph.map.state.time === 1000")
+    assert "dashed: bottom" in page.inner_text(".gauge.depth")
     assert errors == []
 
 

@@ -4,14 +4,18 @@ import base64
 import json
 import re
 import shutil
+import sys
 
 import numpy as np
 import pandas as pd
 import pytest
+from browsers import PRINTS, printing_browser
 
 import rovgraph as rg
 from rovgraph.api.reporting import report
+from rovgraph.cli.app import main
 from rovgraph.log.beams import usable_beams
+from rovgraph.report.pages import printing
 from rovgraph.report.pages.page import Panel, Section, broken, extremes, line, packed, render
 from rovgraph.report.pages.reporting import page_of
 from rovgraph.report.pages.sensors import autocorrelation, valid_share
@@ -81,6 +85,79 @@ def cut(path):
     """The second half of the dive is missing."""
     rows = (path / "trajectory_smoothed.csv").read_text().splitlines(keepends=True)
     (path / "trajectory_smoothed.csv").write_text("".join(rows[: len(rows) // 2]))
+
+
+@pytest.fixture
+def browser(tmp_path, monkeypatch):
+    """Puts a program that prints as Chromium does on PATH, alone."""
+
+    def install(does=PRINTS, name="chromium"):
+        return printing_browser(tmp_path / "bin" / name, does)
+
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    monkeypatch.delenv("ROVGRAPH_BROWSER", raising=False)
+    return install
+
+
+def report_command(monkeypatch, capsys, *arguments):
+    """Exit code, what was printed, and the error, of ``rovgraph report``."""
+    monkeypatch.setattr(sys, "argv", ["rovgraph", "report", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr()
+    return end.value.code or 0, said.out, said.err
+
+
+def test_the_page_is_printed_by_the_browser_that_is_found(own, browser, monkeypatch, capsys):
+    program = browser()
+    before = {path.name for path in own.iterdir()}
+    assert report_command(monkeypatch, capsys, own, "--pdf") == (0, f"printed to {own / 'report.pdf'}\n", "")
+    assert (own / "report.pdf").read_bytes() == b"%PDF-1.4 of " + (own / "report.html").as_uri().encode()
+    assert {path.name for path in own.iterdir()} == before | {"report.pdf"}
+    assert "--headless" in program.with_name("chromium.called").read_text()
+    report(own, pdf=True)  # those of its own names are replaced
+    out = own.parent / "dive.pdf"
+    assert report(own, out=out, pdf=True) == out and out.with_suffix(".html").exists()
+    with pytest.raises(rg.InputError, match=r"dive\.html exists"):
+        report(own, out=out, pdf=True)
+
+
+def test_a_browser_may_be_named(own, browser, monkeypatch):
+    program = browser(name="mine")
+    with pytest.raises(rg.InputError, match="no browser found"):
+        report(own, pdf=True)
+    monkeypatch.setenv("ROVGRAPH_BROWSER", str(program))
+    assert report(own, pdf=True).read_bytes()[:5] == b"%PDF-"
+    monkeypatch.setenv("ROVGRAPH_BROWSER", "another")
+    with pytest.raises(rg.InputError, match="ROVGRAPH_BROWSER=another: no such program"):
+        report(own, pdf=True)
+
+
+def test_without_a_browser_nothing_is_written_and_one_line_says_what_to_do(own, browser, monkeypatch, capsys):
+    (own / "report.html").unlink()
+    before = {path.name for path in own.iterdir()}
+    code, out, error = report_command(monkeypatch, capsys, own, "--pdf")
+    assert (code, out) == (2, "") and error.count("\n") == 1
+    assert "no browser found to print with" in error and "ROVGRAPH_BROWSER" in error
+    assert {path.name for path in own.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("does", "said"),
+    [
+        ("sys.exit('no display')", "printed no PDF of .*: no display"),
+        ("pathlib.Path(out).write_bytes(b'')", "printed no PDF of .*: exit code 0"),
+        ("import time; time.sleep(60)", "printed no PDF of .* within 1 s"),
+    ],
+)
+def test_a_browser_that_prints_nothing_leaves_the_older_pdf(own, browser, monkeypatch, does, said):
+    browser(does)
+    monkeypatch.setattr(printing, "SECONDS", 1.0)
+    (own / "report.pdf").write_bytes(b"older")
+    before = {path.name for path in own.iterdir()}
+    with pytest.raises(rg.InputError, match=said):
+        report(own, pdf=True)
+    assert (own / "report.pdf").read_bytes() == b"older" and {path.name for path in own.iterdir()} == before
 
 
 def test_smooth_and_report_make_the_same_page(own):

@@ -61,6 +61,14 @@ def test_the_misalignment_is_found_with_fixes():
     assert np.rad2deg(graph.values.atVector(peers.M))[0] == pytest.approx(TURNED_DEG, abs=0.3)
     plain = peers.Graph(given, misaligned=False).solve()
     assert evaluate(found, truth, 5.0).rms_m < 0.1 < evaluate(plain, truth, 5.0).rms_m
+    as_it_goes = peers.Incremental(given, misaligned=True).solve()
+    assert evaluate(as_it_goes, truth, 5.0).rms_m < 0.1
+    np.testing.assert_allclose(as_it_goes.p_sd[-1, :2], found.p_sd[-1, :2], rtol=0.1)  # linearised elsewhere
+
+
+def test_lines_are_counted_without_comments_and_docstrings():
+    assert peers.lines_of("rovgraph") == 3
+    assert 70 < peers.lines_of("dead reckoning") < peers.lines_of("plain GTSAM") < 300
 
 
 @pytest.mark.slow

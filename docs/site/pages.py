@@ -44,7 +44,8 @@ RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.live.solution.Event",
 )
 FIRST = ("smooth", "residuals", "mountings", "native_files", "own_sensor", "live")  # of the examples, others by name
-LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
+LINK = re.compile(r'(\]\(|<img src=")(?!\w+:)([^)#\s"]+)')
+IMAGE = re.compile(r'<img [^>]*?src="(?!\w+:)([^"]+)"')
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -63,10 +64,23 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     pages |= {ROOT / folder: name for folder, name in FOLDERS.items()}
 
     def on_the_site(link: re.Match[str]) -> str:
-        target = Path(os.path.normpath(source.parent / link[1]))
-        return f"]({pages.get(target) or os.path.relpath(target, ROOT / 'docs')}{link[2] or ''})"
+        target = Path(os.path.normpath(source.parent / link[2]))
+        return f"{link[1]}{pages.get(target) or os.path.relpath(target, ROOT / 'docs')}"
 
     return LINK.sub(on_the_site, markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> None:
+    """Look for the pictures of a page, which mkdocs does not do for those of HTML.
+
+    Raises
+    ------
+    PluginError : one is missing
+    """
+    folder = os.path.dirname(page.file.src_uri)  # noqa: PTH120
+    absent = [src for src in IMAGE.findall(html) if os.path.normpath(f"{folder or '.'}/{src}") not in files.src_uris]
+    if absent:
+        raise PluginError(f"{page.file.src_uri}: no picture {', '.join(absent)}")
 
 
 def examples() -> str:

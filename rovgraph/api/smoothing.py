@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from rovgraph.model.config import Config
 from rovgraph.process import Progress, no_progress
 from rovgraph.report.export import ExportOptions, Track, fixes_of, write_track
 from rovgraph.report.export.track import ESTIMATES as TRACKS
+
+if TYPE_CHECKING:
+    from rovgraph.report.figures import Plot
 
 ENGINES = ("batch", "isam2")
 ESTIMATES = ("smoothed", "filtered", "both")
@@ -149,6 +152,13 @@ class Result:
     def config(self) -> Config:
         """The effective configuration."""
         return self.dive.initial.config
+
+    @property
+    def plot(self) -> "Plot":
+        """Depth, heading, track and more on matplotlib axes: ``result.plot.depth(axes)``; see `Plot`."""
+        from rovgraph.report.figures import Plot  # loads matplotlib
+
+        return Plot(self.main, self._estimate, self.log, self.config)
 
     def track(self, estimate: str | None = None) -> Track:
         """An estimate with its origin on Earth and its fixes, ready to be exported; None = the best available.

@@ -87,6 +87,9 @@ def report(
         typer.Option("--out", "-o", help="page to write; default: report.html in RESULTS, campaign.html for several"),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older file at --out")] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="print the page to a PDF, too, by Chromium, Chrome or Edge")
+    ] = False,
 ) -> None:
     """Make the page of a results folder again, or a page that compares several dives.
 
@@ -94,7 +97,7 @@ def report(
     """
     import rovgraph as rg
 
-    typer.echo(f"page in {rg.report(*results, out=out, force=force)}")
+    typer.echo(f"{'printed to' if pdf else 'page in'} {rg.report(*results, out=out, force=force, pdf=pdf)}")
 
 
 def export(

@@ -5,7 +5,7 @@ calibration variables are drawn against time with their priors, the track from a
 ellipses, and normalised innovations of every sensor to show whether the measurements fit their stated noise.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rovgraph.errors import InputError, kind_of
 from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.log import Log
+from rovgraph.log import Log, Stream
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.report.colours import PRIOR, REJECTED, UNUSED, USED
@@ -202,28 +203,43 @@ def _series(
 
 def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
     """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
-    main, clock = estimates[0], TimeAxis.of(estimates[0])
+    clock = TimeAxis.of(estimates[0])
     has_bottom = "dvl_altitude" in log
     figure = new_figure(4.8 if has_bottom else 3.6)
     panels: list[Axes] = list(figure.subplots(1 + has_bottom, 1, sharex=True, squeeze=False)[:, 0])
-    panels[0].set_ylabel("depth [m]")
     panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if has_bottom else ""), loc="left")
-    more = []
+    _draw_depth(panels[0], estimates, log, clock)
     if has_bottom:
-        stream, track = log["dvl_altitude"].take(thin(len(log["dvl_altitude"]))), main.trajectory
-        altitude, time = stream["dvl_altitude"], clock(stream.time)
-        below = bottom(track.time, track.p_n[:, 2], stream.time, altitude)
-        panels[0].plot(time, below, label="bottom", **BOTTOM)
-        more.append(span(stream.time, below, np.zeros_like(below), BAND))
-        panels[1].plot(time, altitude, **BOTTOM)
-        panels[1].set_ylabel("altitude [m]")
-        panels[1].set_ylim(bottom=0.0)
-    _series(panels[0], clock, [(estimate, _motion(estimate.trajectory)["depth"]) for estimate in estimates], more)
-    panels[0].invert_yaxis()
+        _draw_altitude(panels[1], log, clock)
     clock.name_axis(panels[-1])
     figure.align_ylabels()
     legend_below(figure, panels)
     return figure
+
+
+def _draw_depth(axes: Axes, estimates: Sequence[Estimate], log: Log, clock: TimeAxis) -> None:
+    """Depth, growing downwards, and the bottom where it is known."""
+    more = []
+    if "dvl_altitude" in log:
+        stream, track = _altitudes(log), estimates[0].trajectory
+        below = bottom(track.time, track.p_n[:, 2], stream.time, stream["dvl_altitude"])
+        axes.plot(clock(stream.time), below, label="bottom", **BOTTOM)
+        more.append(span(stream.time, below, np.zeros_like(below), BAND))
+    _series(axes, clock, [(estimate, _motion(estimate.trajectory)["depth"]) for estimate in estimates], more)
+    axes.yaxis.set_inverted(True)
+    axes.set_ylabel("depth [m]")
+
+
+def _draw_altitude(axes: Axes, log: Log, clock: TimeAxis) -> None:
+    stream = _altitudes(log)
+    axes.plot(clock(stream.time), stream["dvl_altitude"], **BOTTOM)
+    axes.set_ylabel("altitude [m]")
+    axes.set_ylim(bottom=0.0)
+
+
+def _altitudes(log: Log) -> Stream:
+    stream = log["dvl_altitude"]
+    return stream.take(thin(len(stream)))
 
 
 def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
@@ -237,17 +253,14 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     motions = [(estimate, _motion(estimate.trajectory, low)) for estimate in estimates]
     for axes, name in zip(panels, ("roll", "pitch"), strict=False):
         _series(axes, clock, [(estimate, found[name]) for estimate, found in motions])
-    for estimate, found in motions:
-        _draw_heading(panels[2], estimate, found["heading"], clock)
+    _draw_headings(panels[2], motions, samples, low, clock)
     for sensor, (time, heading) in samples.items():
-        label, look = SOURCES[sensor]
-        panels[2].plot(clock(time), within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
+        look = SOURCES[sensor][1]
         difference = np.rad2deg(wrap_angle(heading - main.trajectory.clamped(time).rpy[:, 2]))
         panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
     names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
     for axes, name in zip(panels, names, strict=False):
         axes.set_ylabel(f"{name} [deg]")
-    _limit_heading(panels[2], low)
     title = "attitude, bands ±2 sd" + ("; compasses before their calibration" if samples else "")
     panels[0].set_title(title, loc="left")
     clock.name_axis(panels[-1])
@@ -256,10 +269,22 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     return figure
 
 
-def _draw_heading(axes: Axes, estimate: Estimate, heading: Series, clock: TimeAxis) -> None:
-    some = thin(len(estimate.trajectory))
-    lines = unwrapped(clock(estimate.trajectory.time[some]), heading.value[some], heading.sd[some])
-    _line_and_band(axes, lines[0], lines[1], lines[2], estimate.kind)
+def _draw_headings(
+    axes: Axes,
+    motions: Sequence[tuple[Estimate, dict[str, Series]]],
+    samples: dict[str, tuple[Array, Array]],
+    low: float,
+    clock: TimeAxis,
+) -> None:
+    """Headings of estimates and compasses, broken where they pass the end of the axis."""
+    for estimate, found in motions:
+        some, heading = thin(len(estimate.trajectory)), found["heading"]
+        lines = unwrapped(clock(estimate.trajectory.time[some]), heading.value[some], heading.sd[some])
+        _line_and_band(axes, lines[0], lines[1], lines[2], estimate.kind)
+    for sensor, (time, heading_s) in samples.items():
+        label, look = SOURCES[sensor]
+        axes.plot(clock(time), within(heading_s, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
+    _limit_heading(axes, low)
 
 
 def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tuple[Array, Array]]:
@@ -400,10 +425,23 @@ def draw_track(estimates: Sequence[Estimate], log: Log, config: Config, referenc
     config : names the figure
     reference : a known trajectory, or None
     """
-    main = estimates[0]
     limits = _limits([e.trajectory for e in estimates] + ([reference] if reference is not None else []))
     figure = new_figure(*_size(limits))
     axes = figure.add_subplot()
+    _draw_track(axes, estimates, log, config, limits, reference)
+    legend_below(figure, [axes], 3)
+    return figure
+
+
+def _draw_track(
+    axes: Axes,
+    estimates: Sequence[Estimate],
+    log: Log,
+    config: Config,
+    limits: Array,
+    reference: Trajectory | None = None,
+) -> None:
+    main = estimates[0]
     for estimate in estimates:
         _draw_line(axes, estimate.trajectory, estimate.kind, name_of(estimate.kind))
     if reference is not None:
@@ -417,8 +455,6 @@ def draw_track(estimates: Sequence[Estimate], log: Log, config: Config, referenc
     outside = _draw_fixes(axes, main, log, limits)
     _draw_ends(axes, main)
     _name_axes(axes, limits, config.name, outside)
-    legend_below(figure, [axes], 3)
-    return figure
 
 
 def _limits(tracks: Sequence[Trajectory]) -> Array:
@@ -571,3 +607,124 @@ def draw_figures(
             "calibration": draw_calibration(over_time),
         }
         return [save(figure, folder / f"{name}.{form}") for name, figure in figures.items() if figure is not None]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Quantities of a dive on axes of your own: `Result.plot`.
+
+    Each method takes matplotlib's axes, None = new ones of pyplot in the style of the figures, and the names of the
+    estimates to draw, none = the main one. It returns the axes. Bands hold two sds to each side; time counts from the
+    start of the first estimate, in seconds, or in minutes where it is longer than 20 of them. Lines have labels:
+    ``axes.legend()`` names them.
+
+    Raises
+    ------
+    InputError : what was given is no axes, the result has no such estimate, or the log has none of the quantity
+
+    Attributes
+    ----------
+    main : the estimate that is drawn where none is named
+    of : name -> estimate
+    log, config : what the estimates were made from
+    """
+
+    main: Estimate
+    of: Callable[[str], Estimate]
+    log: Log
+    config: Config
+
+    def track(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """North over east [m] with 99 % ellipses, fixes, start and end, at equal scales."""
+        chosen = self._chosen(estimates)
+        limits = _limits([estimate.trajectory for estimate in chosen])
+        axes = _axes(axes)
+        _draw_track(axes, chosen, self.log, self.config, limits)
+        return axes
+
+    def depth(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """Depth [m], growing downwards, and the bottom where the DVL measured an altitude."""
+        chosen, axes = self._chosen(estimates), _axes(axes)
+        _draw_depth(axes, chosen, self.log, TimeAxis.of(chosen[0]))
+        return self._over_time(axes, chosen)
+
+    def altitude(self, axes: Axes | None = None) -> Axes:
+        """Height over the bottom as the DVL measured it [m]."""
+        if "dvl_altitude" not in self.log:
+            raise InputError(f"{self.log.source}: no altitude to draw; the log has no dvl_altitude")
+        axes = _axes(axes)
+        _draw_altitude(axes, self.log, TimeAxis.of(self.main))
+        return self._over_time(axes, [self.main])
+
+    def heading(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """True heading [deg], and that of each compass before its calibration."""
+        chosen, axes = self._chosen(estimates), _axes(axes)
+        low = lower_end(chosen[0].trajectory.rpy[:, 2])
+        samples = heading_samples(chosen[0].trajectory, self.log, self.config)
+        motions = [(estimate, _motion(estimate.trajectory, low)) for estimate in chosen]
+        _draw_headings(axes, motions, samples, low, TimeAxis.of(chosen[0]))
+        axes.set_ylabel("heading [deg]")
+        return self._over_time(axes, chosen)
+
+    def roll(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """Roll [deg]."""
+        return self._line(axes, estimates, "roll", "roll [deg]")
+
+    def pitch(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """Pitch [deg]."""
+        return self._line(axes, estimates, "pitch", "pitch [deg]")
+
+    def speed(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """Horizontal speed over ground [m/s]."""
+        axes = self._line(axes, estimates, "speed", "speed [m/s]")
+        axes.set_ylim(bottom=0.0)
+        return axes
+
+    def sd(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """sd of the horizontal position along its worst direction [m]."""
+
+        def worst(track: Trajectory) -> Array:
+            known = np.asarray(np.isfinite(track.cov_p).all(axis=(1, 2)))
+            major = ellipse_axes(np.where(known[:, None, None], track.cov_p, 0.0))[0]
+            return np.where(known, major / np.sqrt(CHI2_99), np.nan)
+
+        return self._sds(axes, estimates, worst, "sd of position [m]")
+
+    def heading_sd(self, axes: Axes | None = None, *estimates: str) -> Axes:
+        """sd of the heading [deg]."""
+        return self._sds(axes, estimates, lambda track: np.rad2deg(track.rpy_sd[:, 2]), "sd of heading [deg]")
+
+    def _chosen(self, names: Sequence[str]) -> list[Estimate]:
+        return [self.of(name) for name in names] or [self.main]
+
+    def _line(self, axes: Axes | None, names: Sequence[str], quantity: str, label: str) -> Axes:
+        chosen, axes = self._chosen(names), _axes(axes)
+        found = [(estimate, _motion(estimate.trajectory)[quantity]) for estimate in chosen]
+        _series(axes, TimeAxis.of(chosen[0]), found)
+        axes.set_ylabel(label)
+        return self._over_time(axes, chosen)
+
+    def _sds(self, axes: Axes | None, names: Sequence[str], of: Callable[[Trajectory], Array], label: str) -> Axes:
+        chosen, axes = self._chosen(names), _axes(axes)
+        sds = [(estimate, of(estimate.trajectory)) for estimate in chosen]
+        lines = [(estimate, Series(label, "", sd, np.full_like(sd, np.nan))) for estimate, sd in sds]
+        _series(axes, TimeAxis.of(chosen[0]), lines, [(0.0, 0.0)])
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(label)
+        return self._over_time(axes, chosen)
+
+    def _over_time(self, axes: Axes, estimates: Sequence[Estimate]) -> Axes:
+        TimeAxis.of(estimates[0]).name_axis(axes)
+        return axes
+
+
+def _axes(given: object) -> Axes:
+    """Axes that were given, or new ones that a notebook and ``pyplot.show`` know."""
+    if given is None:
+        from matplotlib import pyplot
+
+        with style():
+            return pyplot.subplots(figsize=(WIDTH, 3.6), layout="constrained")[1]
+    if not isinstance(given, Axes):
+        raise InputError(f"axes: expected matplotlib's Axes or None, found {kind_of(given)}; estimates come after it")
+    return given

@@ -69,12 +69,24 @@ export function niceStep(least) {
   return [1, 2, 5, 10].map((k) => k * power).find((step) => step >= least);
 }
 
-// Deep is below; the newest stands at the right.
-export function depthCurve(canvas, track, now, down) {
+// Depth of the bottom by the last minutes' altitudes, a point a second; null where there is none.
+export class Bottom {
+  constructor() { this.points = []; }
+
+  add(time, down, altitude) {
+    if (this.points.length && time < this.points.at(-1)[0]) this.points = []; // another dive
+    if (this.points.length && time < this.points.at(-1)[0] + 1) return;
+    this.points.push([time, altitude === null ? null : down + altitude]);
+    this.points.splice(0, this.points.findIndex(([then]) => then >= time - DEPTH_S));
+  }
+}
+
+// Deep is below; the newest stands at the right. The bottom is dashed.
+export function depthCurve(canvas, track, now, down, bed) {
   const [c, width, height] = blank(canvas);
   const [left, bottom] = [38, height - 18];
   const points = [...track.since(now - DEPTH_S), [now, down]];
-  const all = points.map((point) => point[1]);
+  const all = [...points, ...bed].map((point) => point[1]).filter((value) => value !== null);
   const [low, high] = [Math.min(...all), Math.max(...all)];
   const spare = Math.max(0.1 * (high - low), (LEAST_SPAN_M - (high - low)) / 2);
   const [top, deep] = [low - spare, high + spare];
@@ -106,6 +118,15 @@ export function depthCurve(canvas, track, now, down) {
   c.lineWidth = 3;
   c.lineJoin = "round";
   c.stroke();
+  c.beginPath();
+  bed.forEach(([time, value], k) => {
+    if (value !== null) c[k && bed[k - 1][1] !== null ? "lineTo" : "moveTo"](x(time), y(value));
+  });
+  c.strokeStyle = palette.soft;
+  c.lineWidth = 2;
+  c.setLineDash([6, 4]);
+  c.stroke();
+  c.setLineDash([]);
 }
 
 // A band of one sd to either side of the value.

@@ -1,6 +1,6 @@
 // Numbers beside the map. Text reaches the page as text only.
 
-import { depthCurve, learntCurve, rose } from "./dials.js";
+import { Bottom, depthCurve, learntCurve, rose } from "./dials.js";
 
 const DEG = 180 / Math.PI;
 const KNOT = 1852 / 3600; // [m/s]
@@ -45,6 +45,7 @@ export class Gauges {
     this.gauges = new Map();
     this.rows = new Map();
     this.curves = new Map();
+    this.bottom = new Bottom();
     this.units = {}; // calibration variable -> factor to what is shown, and its unit
     this.resumed = false; // the track begins where a run before it ended
   }
@@ -68,8 +69,11 @@ export class Gauges {
     this.gauge("gauges", "home", `${metres(far)} m\n${away ? bearing(home) : "–"}`, this.resumed ? "to where it resumed" : "home, to the start");
     this.gauge("gauges", "speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, `speed, ${s.speed === null ? "–" : (s.speed / KNOT).toFixed(1)} kn`);
     if (s.altitude !== null || this.gauges.has("altitude")) this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
-    const depth = this.gauge("gauges", "depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m`, "", true);
-    depthCurve(depth.lastChild, track, s.time, s.down);
+    this.bottom.add(s.time, s.down, s.altitude);
+    const bed = this.bottom.points;
+    const dashed = bed.some((point) => point[1] !== null) ? "; dashed: bottom" : "";
+    const depth = this.gauge("gauges", "depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m${dashed}`, "", true);
+    depthCurve(depth.lastChild, track, s.time, s.down, bed);
     this.gauge("gauges", "north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);
     this.gauge("gauges", "east", `${metres(s.east)} m`, `east, sd ${spread(s.east_sd)} m`);
     this.gauge("gauges", "distance", `${metres(s.distance)} m`, "travelled");
