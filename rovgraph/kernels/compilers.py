@@ -11,8 +11,10 @@ that its callers have.
 from typing import Any, cast
 
 from llvmlite.binding import parse_assembly, parse_bitcode
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
+from numba.core.runtime import rtsys
 
 
 class _NoEnvironment:
@@ -86,3 +88,19 @@ class UncalledKernelCompiler(KernelCompiler):
         """As numba's."""
         self.state.flags.no_cfunc_wrapper = True
         return super().define_pipelines()
+
+
+class KernelCache(FunctionCache):
+    """Machine code is loaded without setting up all that numba can compile, which takes a third of a second.
+
+    Kernels need its allocator alone. Those of other packages may call BLAS, which is part of what is left out.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """As numba's."""
+        numbas: Any = self
+        if numbas._py_func.__module__.rpartition(".")[0] != __package__:
+            return cast(Any, super()).load_overload(sig, target_context)
+        cast(Any, rtsys).initialize(target_context)
+        with numbas._guard_against_spurious_io_errors():
+            return numbas._load_overload(sig, target_context)
