@@ -11,7 +11,7 @@ that its callers have.
 from typing import Any, cast
 
 from llvmlite.binding import parse_assembly, parse_bitcode
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 from numba.core.runtime import rtsys
@@ -90,11 +90,23 @@ class UncalledKernelCompiler(KernelCompiler):
         return super().define_pipelines()
 
 
+class _KernelCacheImpl(CompileResultCacheImpl):
+    """Keeps the environments of a kernel that its machine code uses, of some forty that were linked into it."""
+
+    def reduce(self, cres: Any) -> tuple[Any, ...]:
+        """As numba's."""
+        *rest, environments = cast(Any, super()).reduce(cres)
+        code = str(cres.library._final_module)
+        return *rest, [each for each in environments if code.count(each.env_name) != 1]  # 1: its definition
+
+
 class KernelCache(FunctionCache):
     """Machine code is loaded without setting up all that numba can compile, which takes a third of a second.
 
     Kernels need its allocator alone. Those of other packages may call BLAS, which is part of what is left out.
     """
+
+    _impl_class = _KernelCacheImpl
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """As numba's."""
