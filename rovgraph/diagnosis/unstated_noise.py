@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.diagnosis import Alarm, Statistic
+from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.constants import FEIGNED, RELEASED
 from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.distributions import chi_square_quantile
