@@ -38,7 +38,7 @@ from rovgraph.geometry import Array
 try:
     import numba
     from numba import njit, types
-    from numba.core import dispatcher
+    from numba.core import caching, dispatcher
     from numba.extending import register_jitable
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61,<0.69'") from None
@@ -146,7 +146,7 @@ class _Compilation(NamedTuple):
     view_helper: dict[str, Any] = KERNEL
     kernel: dict[str, Any] = KERNEL
     called_kernel: dict[str, Any] = KERNEL
-    cache: Any = dispatcher.FunctionCache
+    cache: Any = caching.FunctionCache
 
 
 @cache
@@ -370,15 +370,15 @@ def _imported_kernels(name: str) -> frozenset[str]:
 @contextlib.contextmanager
 def _cache_in(folder: Path | None, kind: Any) -> Iterator[None]:
     """Have numba cache there, in a cache of this kind, what is decorated meanwhile, and nothing else."""
-    before, numbas = config.CACHE_DIR, dispatcher.FunctionCache
+    numbas: Any = dispatcher
+    before = config.CACHE_DIR, numbas.FunctionCache
     if folder is not None:
         config.CACHE_DIR = str(folder)
-    cast(Any, dispatcher).FunctionCache = kind
+    numbas.FunctionCache = kind
     try:
         yield
     finally:
-        config.CACHE_DIR = before
-        cast(Any, dispatcher).FunctionCache = numbas
+        config.CACHE_DIR, numbas.FunctionCache = before
 
 
 def _first_line(error: Exception) -> str:

@@ -14,7 +14,7 @@ from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 
 class _NoEnvironment:
@@ -113,6 +113,7 @@ class KernelCache(FunctionCache):
         numbas: Any = self
         if numbas._py_func.__module__.rpartition(".")[0] != __package__:
             return cast(Any, super()).load_overload(sig, target_context)
-        cast(Any, rtsys).initialize(target_context)
+        allocator: Any = rtsys
+        allocator.initialize(target_context)
         with numbas._guard_against_spurious_io_errors():
             return numbas._load_overload(sig, target_context)
