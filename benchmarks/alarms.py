@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from online import messages
 
-from rovgraph.diagnosis import verdict_of
+from rovgraph.diagnosis.alarm import verdict_of
 from rovgraph.dive import smooth
 from rovgraph.lab.misalignment.plan import GRADES
 from rovgraph.live.clocks import Clocks

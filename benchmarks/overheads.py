@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.diagnosis import Evidence, statistics
+from rovgraph.diagnosis.evidence import Evidence
+from rovgraph.diagnosis.statistics import statistics
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.initialise import initialise
 from rovgraph.inference.smoother import assemble, smoothed

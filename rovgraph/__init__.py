@@ -35,7 +35,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 Layers (imports go downwards only)
 ----------------------------------
 cli / rovgraph / api, extend / report, web / live, lab / dive, readers / diagnosis / simulate / inference / problem /
-rules / log / sensors / model / kernels / dates / compatibility, geometry /
+rules / log / sensors / model / kernels / dates / compatibility, distributions, geometry /
 errors, process, _version.
 """
 

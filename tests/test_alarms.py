@@ -28,9 +28,9 @@ from dives import (
 from test_places import circle
 
 from rovgraph.cli.app import main
-from rovgraph.diagnosis import RULES, Statistic, find_alarms, verdict_of
-from rovgraph.diagnosis.alarm import alarm_of
+from rovgraph.diagnosis.alarm import Statistic, alarm_of, verdict_of
 from rovgraph.diagnosis.constants import TIME_OFFSETS
+from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.dive import DiveEstimates, smooth
 from rovgraph.geometry import rotate, transpose
 from rovgraph.inference.chain_optimum import ChainOptimum
@@ -39,6 +39,7 @@ from rovgraph.inference.score_test import score_test
 from rovgraph.inference.smoother import assemble
 from rovgraph.log import Log
 from rovgraph.model.config import load_config, mount_matrix
+from rovgraph.rules import RULES
 
 SECONDS = 200.0
 SHIPPED, SHIPPED_S = Path(__file__).parents[1] / "data" / "falcon", 160.0

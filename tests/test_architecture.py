@@ -16,7 +16,7 @@ PACKAGE = ROOT / "rovgraph"
 # Bottom first, the package itself among them. Members of one layer are independent: they may not import each other.
 LAYERS = (
     {"errors", "process", "_version"},
-    {"compatibility", "geometry"},
+    {"compatibility", "distributions", "geometry"},
     {"dates"},
     {"kernels"},
     {"model"},

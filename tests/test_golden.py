@@ -20,7 +20,7 @@ from dives import Simulated, as_log, changed, falcon, simulated, started, withou
 from live import message, turned
 from test_no_imu import with_attitude
 
-from rovgraph.diagnosis import Alarm
+from rovgraph.diagnosis.alarm import Alarm
 from rovgraph.dive import DiveEstimates, smooth
 from rovgraph.geometry import Array
 from rovgraph.inference.estimate import Estimate

@@ -170,6 +170,16 @@ def test_where_the_disk_is_full_there_is_no_cache(tmp_path, monkeypatch):
     assert compiling.cache_folder("rovgraph.kernels.chain") is None
 
 
+def test_kernels_are_loaded_without_what_numba_compiles_with():
+    code = (
+        "import sys, importlib; from rovgraph.kernels.compile import _modules; "
+        "[importlib.import_module(f'rovgraph.kernels.{name}') for name in _modules()]; "
+        "print({'numba.cpython.unicode', 'numba.np.arrayobj', 'scipy.linalg'} & set(sys.modules))"
+    )
+    run(code)  # compiles what is missing
+    assert run(code).stdout == "set()\n"
+
+
 def test_modules_with_kernels_are_those_that_decorate_one():
     from rovgraph.kernels.compile import _modules
 

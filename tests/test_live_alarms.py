@@ -10,7 +10,7 @@ from dives import Simulated, falcon, simulated
 from live import message
 from rich.console import Console
 
-from rovgraph.diagnosis import RULES, Statistic
+from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.live.alarms import OVER_S, LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
@@ -18,6 +18,7 @@ from rovgraph.live.outputs.json_lines import json_line
 from rovgraph.live.solution import Event, Solution
 from rovgraph.log import Log
 from rovgraph.report.status import status
+from rovgraph.rules import RULES
 from rovgraph.simulate import Choices
 from rovgraph.simulate import simulated as named
 

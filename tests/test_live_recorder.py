@@ -22,6 +22,7 @@ from rovgraph.live.files import ARRAY, Recorder, read_checkpoint, recorded_colum
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
+from rovgraph.log.streams import labels
 
 HEADER = recorded_columns()
 EPOCH = 1.7e9

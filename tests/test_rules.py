@@ -13,30 +13,29 @@ import pytest
 from dives import falcon, level_log
 from scipy.stats import chi2, norm
 
-from rovgraph.diagnosis import (
-    RULES,
-    Evidence,
-    Rule,
-    Severity,
-    Statistic,
-    constants,
-    find_advice,
-    find_alarms,
-    motion,
-    residuals,
-    verdict_of,
-)
+from rovgraph.diagnosis import constants, motion, residuals
 from rovgraph.diagnosis import motion as stretches
 from rovgraph.diagnosis import residuals as sensors
-from rovgraph.diagnosis.alarm import Alarm, alarm_of
-from rovgraph.diagnosis.evidence import SensorResiduals
+from rovgraph.diagnosis.alarm import Alarm, Statistic, alarm_of, verdict_of
+from rovgraph.diagnosis.evidence import Evidence, SensorResiduals
+from rovgraph.diagnosis.statistics import find_advice, find_alarms
 from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate, History
 from rovgraph.inference.gauss_newton import FaultyInterval
 from rovgraph.inference.score_test import ScoreTest
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import TABLE
-from rovgraph.rules import BELIEVED_SDS, CHANCE, COMPARISONS, comparison_table, remedy_of_lag, rule_table
+from rovgraph.rules import (
+    BELIEVED_SDS,
+    CHANCE,
+    COMPARISONS,
+    RULES,
+    Rule,
+    Severity,
+    comparison_table,
+    remedy_of_lag,
+    rule_table,
+)
 
 ALARMS = Path(__file__).parents[1] / "docs" / "alarms.md"
 START, SECONDS, RATE = 1000.0, 300, 10  # of the dives here [s, s, Hz]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dives import altered, batch, changed, falcon, simulated, true_at
 
-from rovgraph.diagnosis import find_alarms
+from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.diagnosis.unstated_noise import find_errors, find_noise, noise_factor, unstated
 from rovgraph.dive import smooth
 from rovgraph.inference.chain import Chain

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rovgraph.api.logs import config_of, prepared
-from rovgraph.diagnosis import Alarm, Verdict
+from rovgraph.diagnosis.alarm import Alarm, Verdict
 from rovgraph.dive import DiveEstimates
 from rovgraph.dive import smooth as smooth_dive
 from rovgraph.errors import InputError, as_path, as_texts, collected_warnings

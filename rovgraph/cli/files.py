@@ -1,4 +1,4 @@
-"""Options of all commands that read logs: native files, which of their channels, and shifts of clocks."""
+"""Options that commands share: native files, which of their channels, shifts of clocks, the configuration."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +28,8 @@ Times = Annotated[
         metavar="[NAME=]arrival",
     ),
 ]
+ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]
+Force = Annotated[bool, typer.Option("--force", help="replace an older results folder")]
 
 
 def read_files(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, Times, name_of, read_files
+from rovgraph.cli.files import Choose, ConfigPath, Files, Force, Shift, Times, name_of, read_files
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -154,7 +154,7 @@ def compare(
     files: Annotated[
         list[Path] | None, typer.Argument(help="a log, or native files of one dive", metavar="[FILE...]")
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     reference: Annotated[
         Path | None, typer.Option(help="CSV with time, north, east, and optionally attitude and velocity")
     ] = None,
@@ -169,7 +169,7 @@ def compare(
         typer.Option(help="names or patterns (graph-*), separated by commas; default: all without thrusters"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    force: Force = False,
     choose: Choose = None,
     shift: Shift = None,
     times: Times = None,
@@ -209,12 +209,12 @@ OBSERVATION_WIDTH = 150  # columns of a file or a pipe, which has no width of it
 
 def observe(
     files: Files,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: observed-LOG")] = None,
     estimate: Annotated[
         str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    force: Force = False,
     choose: Choose = None,
     shift: Shift = None,
     times: Times = None,
@@ -245,7 +245,7 @@ def observe(
 
 def plan(
     out: Annotated[Path, typer.Option("--out", "-o", help="results folder", show_default=False)],
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     known: Annotated[Path | None, typer.Option(help="observability.json of an earlier dive; default: none")] = None,
     goal: Annotated[
         list[str] | None, typer.Option(help="wanted sd, such as dvl_yaw=1deg; may be repeated", metavar="NAME=SD")
@@ -261,7 +261,7 @@ def plan(
     fix_interval: Annotated[float | None, typer.Option(help="seconds between position fixes; default: none")] = None,
     imu_rate: Annotated[float, typer.Option(help="rate of the IMU, 5 to 1000 Hz")] = 100.0,
     dvl_rate: Annotated[float, typer.Option(help="rate of the DVL's pings, 0.1 to 50 Hz")] = 5.6,
-    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    force: Force = False,
 ) -> None:
     """Rank manoeuvres by how well they would determine the calibration, before the dive.
 
@@ -343,9 +343,7 @@ calibrate = typer.Typer(
 )
 
 LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
-ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]
 OutPath = Annotated[Path, typer.Option("--out", "-o", help="results folder to create", show_default=False)]
-Force = Annotated[bool, typer.Option("--force", help="replace an older results folder")]
 
 
 class Method(StrEnum):

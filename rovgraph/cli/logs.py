@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, Times, pairs, read_files, seconds, whose
+from rovgraph.cli.files import Choose, ConfigPath, Files, Shift, Times, pairs, read_files, seconds, whose
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def check(
     files: Files,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
     choose: Choose = None,
     shift: Shift = None,
@@ -236,7 +236,7 @@ WIDE = 150  # columns of a file or a pipe, which has no width of its own
 def convert(
     files: Files,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="log to write: .csv, .csv.gz or .parquet")] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     config_out: Annotated[Path | None, typer.Option(help="also write a configuration to begin with (YAML)")] = None,
     choose: Choose = None,
     shift: Shift = None,

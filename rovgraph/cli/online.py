@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rovgraph.cli.files import ConfigPath
+
 if TYPE_CHECKING:
     from rovgraph.live.solution import Solution
 
@@ -55,7 +57,7 @@ class OnlineEngine(StrEnum):
 
 def online(
     sources: Annotated[list[str], typer.Argument(help="URLs, see docs/online.md", metavar="SOURCE...")],
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="folder for recording, track and checkpoint")] = None,
     output: Annotated[
         list[str] | None, typer.Option("--output", help="where to send solutions; default: - unless on a terminal")

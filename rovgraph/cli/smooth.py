@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, Times, name_of, read_files
+from rovgraph.cli.files import Choose, ConfigPath, Files, Force, Shift, Times, name_of, read_files
 
 if TYPE_CHECKING:
     from rovgraph import Result
@@ -40,14 +40,14 @@ class Figures(StrEnum):
 
 def smooth(
     files: Files,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    config: ConfigPath = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
         SmoothEngine | None,
         typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; default: graph.solver"),
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
-    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    force: Force = False,
     figures: Annotated[Figures, typer.Option(help="format of the figures")] = Figures.png,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="draw none")] = False,
     export: Annotated[

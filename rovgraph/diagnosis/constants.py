@@ -1,9 +1,9 @@
 """Alarms on constants: estimated ones far from their prior, and held ones that the measurements contradict."""
 
 from collections.abc import Iterator
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import ndtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
@@ -139,7 +139,7 @@ def _moved(
 ) -> Statistic:
     """A shift in its sds, the largest of several: the fewer there are, the less of it is chance."""
     rule = RULES["moved"]
-    factor = float(ndtri(1.0 - 0.5 * rule.rate / max(several, 1))) / rule.doubtful
+    factor = NormalDist().inv_cdf(1.0 - 0.5 * rule.rate / max(several, 1)) / rule.doubtful
     return Statistic("moved", sensor, begin, end, figure, cause, remedy, factor)
 
 

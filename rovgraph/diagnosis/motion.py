@@ -18,11 +18,11 @@ from dataclasses import replace
 from math import exp, isfinite
 
 import numpy as np
-from scipy.special import chdtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.diagnosis.evidence import Evidence, span, windows
+from rovgraph.distributions import chi_square_quantile
 from rovgraph.geometry import Array, cross, rotate, transpose, wrap_angle
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.gauss_newton import FaultyInterval
@@ -66,7 +66,7 @@ def imu_disagreement(evidence: Evidence) -> Iterator[Statistic]:
         return np.asarray((sums**2 / np.maximum(count, 1)[:, None])[full])
 
     squares, n = means(r), int(full.sum())
-    by_chance = float(chdtri(n, CHANCE)) / n
+    by_chance = chi_square_quantile(n, CHANCE) / n
     if squares.mean(axis=0).max() > max(RULES["imu"].doubtful, by_chance):
         squares = squares / (1.0 + sum(map(means, _moved_motions(evidence, r))))
     for part, columns, key in PARTS:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtri
 
 from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
+from rovgraph.distributions import binomial_tail, chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.problem.motion import has_constant_velocity
@@ -69,7 +69,7 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
 
 def _gives_up(out: NDArray[np.bool_]) -> bool:
     """Whether a sensor of few measurements, as fixes now and then, was rejected too often in the dive, shape (n,)."""
-    by_chance = float(bdtrc(max(int(out.sum()) - 1, 0), len(out), USUAL_SHARE)) > CHANCE
+    by_chance = binomial_tail(max(int(out.sum()) - 1, 0), len(out), USUAL_SHARE) > CHANCE
     return bool(out.mean() > GIVEN_UP) and not by_chance
 
 
@@ -80,7 +80,9 @@ def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
     ----------
     out, count : ndarray, shape (m,), those that were rejected, and all
     """
-    by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1).astype(np.int64), USUAL_SHARE) > CHANCE
+    by_chance = [
+        binomial_tail(max(int(k) - 1, 0), max(int(n), 1), USUAL_SHARE) > CHANCE for k, n in zip(out, count, strict=True)
+    ]
     return np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
 
 
@@ -126,7 +128,7 @@ def too_large_in(
 
     ``start`` is when the dive began [s]; ``factor`` raises the limits.
     """
-    by_chance = float(chdtri(max(count, 1), CHANCE)) / max(count, 1)
+    by_chance = chi_square_quantile(max(count, 1), CHANCE) / max(count, 1)
     return Statistic(
         "too large",
         sensor,
@@ -183,7 +185,7 @@ def innovations(evidence: Evidence) -> Iterator[Statistic]:
             mean,
             f"it surprises the filter: its innovations are {np.sqrt(mean):.1f} times as large as their stated sd",
             f"check the instrument, its mounting and clock (rovgraph check), or raise {sd_key(sensor)}",
-            chance=float(chdtri(count, CHANCE)) / count,
+            chance=chi_square_quantile(count, CHANCE) / count,
         )
 
 
@@ -290,8 +292,10 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
             begin = start + float(np.flatnonzero(full)[k]) * seconds
             # all windows together, and the largest of them
             n = len(square)
-            out.append((seconds, component, float(square.mean()), float(chdtri(n, CHANCE)) / n, begin))
-            out.append((seconds, component, float(square[k]) / OF_ONE, float(chdtri(1, CHANCE / n)) / OF_ONE, begin))
+            out.append((seconds, component, float(square.mean()), chi_square_quantile(n, CHANCE) / n, begin))
+            out.append(
+                (seconds, component, float(square[k]) / OF_ONE, chi_square_quantile(1, CHANCE / n) / OF_ONE, begin)
+            )
     return max(out, key=lambda one: one[2] / max(RULES["lasting"].doubtful, one[3]), default=None)
 
 

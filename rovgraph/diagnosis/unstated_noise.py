@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
-from rovgraph.diagnosis import Alarm, Statistic
+from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.constants import FEIGNED, RELEASED
 from rovgraph.diagnosis.residuals import SD_KEY
+from rovgraph.distributions import chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival, find_correlated_noise
@@ -247,7 +247,7 @@ def noise_factor(r: Array) -> float | None:
     if len(r) <= ENOUGH:
         return None
     squares = np.sum(np.diff(r, axis=0) ** 2, axis=1)
-    return float(np.sqrt(np.median(squares) / (2.0 * chdtri(r.shape[1], 0.5))))
+    return float(np.sqrt(np.median(squares) / (2.0 * chi_square_quantile(r.shape[1], 0.5))))
 
 
 def _is_stated(best: ChainOptimum, sensor: str) -> bool:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain, chain_posterior
@@ -112,7 +111,7 @@ class SquareRoot:
         ndarray, shape (c,), of the border
         """
         free, y = len(self.border) - held, np.zeros(len(self.border))
-        y[:free] = _solve_upper(self.border[:free, :free], self.border[:free, -1])
+        y[:free] = solve_upper(self.border[:free, :free], self.border[:free, -1])
         return self.followed(y), y
 
     def followed(self, y: Array) -> Array:
@@ -137,7 +136,7 @@ class SquareRoot:
         rest = Q.T @ ((0.0 if unforced else z) - R @ out)
         if score is not None:
             rest += np.linalg.solve(R_free.T, score[free])
-        out[free] = _solve_upper(R_free, rest)
+        out[free] = solve_upper(R_free, rest)
         return out
 
     def move_to(self, y: Array) -> None:
@@ -169,11 +168,11 @@ class SquareRoot:
         held = 0 if believed is None else len(believed)
         free = len(self.border) - held
         R = self.border[:free, :free]
-        root = _solve_upper(R, np.eye(free))
+        root = solve_upper(R, np.eye(free))
         P = np.zeros((len(self.border), len(self.border)))
         P[:free, :free] = root @ root.T
         if believed is not None:
-            gain = np.vstack([-_solve_upper(R, self.border[:free, free:-1]), np.eye(held)])
+            gain = np.vstack([-solve_upper(R, self.border[:free, free:-1]), np.eye(held)])
             P += gain @ believed @ gain.T
         return P
 
@@ -235,7 +234,7 @@ class SquareRoot:
         """Joint covariance of the last keyframe and the border, shape (d + c, d + c); ``P_y`` is that of the border."""
         last, c = self.conditionals[-1], len(self.border)
         d = len(last)
-        root = _solve_upper(last[:, :d], np.eye(d))
+        root = solve_upper(last[:, :d], np.eye(d))
         X = -root @ last[:, 2 * d : 2 * d + c]
         cross = X @ P_y
         return np.block([[root @ root.T + cross @ X.T, cross], [cross.T, P_y]])
@@ -292,8 +291,9 @@ def square_root(
     return SquareRoot(conditionals, border, float(left[0]), filtered)
 
 
-def _solve_upper(R: Array, rhs: Array) -> Array:
-    return np.asarray(solve_triangular(R, rhs)) if len(R) else np.zeros_like(rhs)
+def solve_upper(R: Array, rhs: Array) -> Array:
+    """R^-1 of a right-hand side, R upper triangular: LU leaves such a matrix as it is."""
+    return np.asarray(np.linalg.solve(R, rhs))
 
 
 @dataclass(frozen=True)

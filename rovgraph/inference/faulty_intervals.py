@@ -31,8 +31,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtri
 
+from rovgraph.distributions import binomial_tail, chi_square_quantile
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.gauss_newton import (
@@ -268,9 +268,11 @@ def _bursts_of(time: Array, out: NDArray[np.bool_]) -> Iterator[tuple[float, flo
     begin, end = time.searchsorted(time - half), time.searchsorted(time + half, side="right")
     count = np.concatenate([[0], np.cumsum(out)])
     k, n = count[end] - count[begin], end - begin
-    chance = bdtrc(k - 1, n, max(USUAL_SHARE, float(np.median(k / n))))
-    for at in np.flatnonzero(out & (chance < CHANCE)):
-        yield float(time[at]), float(time[at]), float(chance[at])
+    share = max(USUAL_SHARE, float(np.median(k / n)))
+    for at in np.flatnonzero(out):
+        chance = binomial_tail(int(k[at]) - 1, int(n[at]), share)
+        if chance < CHANCE:
+            yield float(time[at]), float(time[at]), chance
 
 
 def _joined(windows: Sequence[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
@@ -363,7 +365,7 @@ def _price(problem: Linearizable[Point, Step], solution: GaussNewtonResult[Point
     measured = problem.measured()
     barred = _barred(measured, solution.stretches)
     numbers = [int(out.sum()) * measured[sensor].dim for sensor, out in barred.items()]
-    return _level(problem, solution) * 0.5 * sum(float(chdtri(n, CHANCE)) for n in numbers)
+    return _level(problem, solution) * 0.5 * sum(chi_square_quantile(n, CHANCE) for n in numbers)
 
 
 def _level(problem: Linearizable[Point, Step], solution: GaussNewtonResult[Point]) -> float:

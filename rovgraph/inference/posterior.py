@@ -19,12 +19,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_triangular
 
 from rovgraph.geometry import Array, cross, exp_rotation, log_rotation, rotate, skew
 from rovgraph.inference.assumptions import rests_on_doubtful_compass
 from rovgraph.inference.chain import MOTION, ChainStep
-from rovgraph.inference.chain_information import SquareRoot
+from rovgraph.inference.chain_information import SquareRoot, solve_upper
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.kernels import chain_posterior
 from rovgraph.kernels.assembly import FIRST, LAST
@@ -224,7 +223,7 @@ class Posterior:
             y = rng.standard_normal((len(R), some))
             y[free:] *= np.sqrt(np.diagonal(believed))[:, None]
             if free:
-                y[:free] = solve_triangular(R[:free, :free], y[:free] - R[:free, free:-1] @ y[free:])
+                y[:free] = solve_upper(R[:free, :free], y[:free] - R[:free, free:-1] @ y[free:])
             x = rng.standard_normal((n, d, some))
             chain_posterior.back_substitute(root.conditionals, y, x)
             for j in range(some):
@@ -322,16 +321,14 @@ class Posterior:
         arm, problem = np.asarray(self.initial.config.imu.lever_arm_m, float), self.optimum.problem
         rate_b = np.stack([np.interp(times, self.time, axis) for axis in problem.rate_b.T], axis=-1) - bias[:, 3:]
         rate_sd = np.interp(times, self.time, problem.rate_sd)
-        moves, noise = [], []
-        for R, velocity_b, sd in zip(R_nb, cross(rate_b, arm), rate_sd, strict=True):
-            A, Q = np.eye(MOTION), np.zeros((MOTION, MOTION))
+        moves, noise = np.eye(len(times) * MOTION), np.zeros((len(times) * MOTION, len(times) * MOTION))
+        for k, (R, velocity_b, sd) in enumerate(zip(R_nb, cross(rate_b, arm), rate_sd, strict=True)):
+            own = slice(k * MOTION, (k + 1) * MOTION)
+            A, Q = moves[own, own], noise[own, own]
             A[POSITION, ROTATION] = skew(arm)
             A[VELOCITY, ROTATION], A[VELOCITY, 12:] = R @ skew(velocity_b), -R @ skew(arm)
             Q[VELOCITY, VELOCITY] = sd**2 * (R @ skew(arm)) @ (R @ skew(arm)).T
-            moves.append(A)
-            noise.append(Q)
-        A = block_diag(*moves)
-        return np.asarray(A @ P @ A.T + block_diag(*noise))
+        return np.asarray(moves @ P @ moves.T + noise)
 
     def _displaced(self, P: Array, times: Array, R_nb: Array) -> Array:
         """With what displaces all positions together, to what `body_trajectory` has."""

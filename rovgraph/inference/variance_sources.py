@@ -12,11 +12,10 @@ A long dive is processed in pieces, since its conditionals and the Jacobians of 
 """
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from rovgraph.geometry import Array, transpose
 from rovgraph.inference.chain import COLUMNS, MOTION, Chain, ChainStep
-from rovgraph.inference.chain_information import SquareRoot
+from rovgraph.inference.chain_information import SquareRoot, solve_upper
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.kernels import chain_posterior
 from rovgraph.model.calibration import TABLE
@@ -80,7 +79,7 @@ def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tu
     if free:
         rest = -np.einsum("kdc,kdm->cm", later[:, :, 2 * d : 2 * d + free], z[keyframe:])
         R = root.border[:free, :free]
-        y[:free] = solve_triangular(R, solve_triangular(R, rest, trans="T"))
+        y[:free] = solve_upper(R, np.linalg.solve(R.T, rest))
     chain_posterior.back_substitute(root.conditionals, y, z)
     return z, y
 
@@ -95,7 +94,7 @@ def _by_held(root: SquareRoot, keyframe: int, held: int) -> Array:
     y = np.zeros((len(root.border), held))
     y[free:] = np.eye(held)
     if free:
-        y[:free] = -solve_triangular(root.border[:free, :free], root.border[:free, free:-1])
+        y[:free] = -solve_upper(root.border[:free, :free], root.border[:free, free:-1])
     x = np.zeros((*later.shape[:2], held))
     chain_posterior.back_substitute(later, y, x)
     return np.asarray(x[0])

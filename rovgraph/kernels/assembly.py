@@ -375,7 +375,7 @@ def _learn(keyframes: Array, k: int, acc: float, gyr: float) -> None:
     j = k
     while j > 0 and count < INTERVALS:
         if not math.isnan(keyframes[j, SCATTER]):
-            seen[count] = keyframes[j, SCATTER : SCATTER + 2]
+            seen[count, 0], seen[count, 1] = keyframes[j, SCATTER], keyframes[j, SCATTER + 1]
             count += 1
         j -= 1
     noise = (acc, gyr)
@@ -503,7 +503,8 @@ def _motion(
     longest, within, acc, gyr = survey(imu, dive.keyframes[k - 1, TIME], keyframe[TIME])
     for i in range(motion_row.ROW):
         row[i] = integration.row[i]
-    keyframe[BELIEVED : BELIEVED + 2] = dive.keyframes[k - 1, BELIEVED : BELIEVED + 2]
+    for i in range(BELIEVED, BELIEVED + 2):
+        keyframe[i] = dive.keyframes[k - 1, i]
     keyframe[SCATTER] = keyframe[SCATTER + 1] = math.nan
     noise = row[motion_row.NOISE : motion_row.NOISE + 2]
     if rule.without_imu != 0.0:  # constant velocity; in a long outage the heading is unknown
@@ -649,7 +650,8 @@ def assemble(
         )
         keyframe[FIRST], keyframe[LAST] = first, last
         if k == 0:
-            keyframe[BELIEVED : BELIEVED + 2] = integration.row[motion_row.NOISE : motion_row.NOISE + 2]
+            for i in range(2):
+                keyframe[BELIEVED + i] = integration.row[motion_row.NOISE + i]
             keyframe[SCATTER] = keyframe[SCATTER + 1] = math.nan
         keyframe[SIGHTED] = 0.0 if k == 0 else dive.keyframes[k - 1, SIGHTED]
         if k > 0:

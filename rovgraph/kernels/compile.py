@@ -38,6 +38,7 @@ from rovgraph.geometry import Array
 try:
     import numba
     from numba import njit, types
+    from numba.core import caching, dispatcher
     from numba.extending import register_jitable
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61,<0.69'") from None
@@ -124,7 +125,7 @@ def kernel(signature: str | None = None, by_address: bool = False) -> Callable[[
         options = _compilation().called_kernel if by_address else _compilation().kernel
         folder, call_signature = cache_folder(function.__module__), signature or signature_of(function)
         try:
-            with _cache_in(folder):
+            with _cache_in(folder, _compilation().cache):
                 compiled = njit(call_signature, cache=folder is not None, **options)(function)
         except OSError:  # the folder went away, or the disk is full
             compiled = njit(call_signature, **options)(function)
@@ -145,6 +146,7 @@ class _Compilation(NamedTuple):
     view_helper: dict[str, Any] = KERNEL
     kernel: dict[str, Any] = KERNEL
     called_kernel: dict[str, Any] = KERNEL
+    cache: Any = caching.FunctionCache
 
 
 @cache
@@ -175,11 +177,11 @@ def _compilation() -> _Compilation:
 
 
 def _special_compilation() -> _Compilation:
-    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
+    from rovgraph.kernels.compilers import HelperCompiler, KernelCache, KernelCompiler, UncalledKernelCompiler
 
     helping = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
     kernel, called = ({**KERNEL, "pipeline_class": each} for each in (UncalledKernelCompiler, KernelCompiler))
-    return _Compilation(helping, {**helping, "_nrt": False}, kernel, called)
+    return _Compilation(helping, {**helping, "_nrt": False}, kernel, called, KernelCache)
 
 
 def _double(x: Array) -> float:
@@ -194,7 +196,7 @@ def _double_more(x: Array) -> float:
 def _try_out(options: _Compilation) -> None:
     """Compile a kernel with a helper, keep it, and load it: an error shows that numba does not take the options."""
     register_jitable(**options.view_helper)(_double)
-    with tempfile.TemporaryDirectory() as folder, _cache_in(Path(folder)):
+    with tempfile.TemporaryDirectory() as folder, _cache_in(Path(folder), options.cache):
         for each in (options.kernel, options.called_kernel):
             made, loaded = (njit("f8(f8[::1])", cache=True, **each)(_double_more) for _ in range(2))
             if not made(np.ones(1)) == loaded(np.ones(1)) == 3.0:
@@ -366,15 +368,17 @@ def _imported_kernels(name: str) -> frozenset[str]:
 
 
 @contextlib.contextmanager
-def _cache_in(folder: Path | None) -> Iterator[None]:
-    """Have numba cache there what is decorated meanwhile, and nothing else."""
-    before = config.CACHE_DIR
+def _cache_in(folder: Path | None, kind: Any) -> Iterator[None]:
+    """Have numba cache there, in a cache of this kind, what is decorated meanwhile, and nothing else."""
+    numbas: Any = dispatcher
+    before = config.CACHE_DIR, numbas.FunctionCache
     if folder is not None:
         config.CACHE_DIR = str(folder)
+    numbas.FunctionCache = kind
     try:
         yield
     finally:
-        config.CACHE_DIR = before
+        config.CACHE_DIR, numbas.FunctionCache = before
 
 
 def _first_line(error: Exception) -> str:

@@ -11,8 +11,10 @@ that its callers have.
 from typing import Any, cast
 
 from llvmlite.binding import parse_assembly, parse_bitcode
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
+from numba.core.runtime.nrt import rtsys
 
 
 class _NoEnvironment:
@@ -86,3 +88,32 @@ class UncalledKernelCompiler(KernelCompiler):
         """As numba's."""
         self.state.flags.no_cfunc_wrapper = True
         return super().define_pipelines()
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    """Keeps the environments of a kernel that its machine code uses, of some forty that were linked into it."""
+
+    def reduce(self, cres: Any) -> tuple[Any, ...]:
+        """As numba's."""
+        *rest, environments = cast(Any, super()).reduce(cres)
+        code = str(cres.library._final_module)
+        return *rest, [each for each in environments if code.count(each.env_name) != 1]  # 1: its definition
+
+
+class KernelCache(FunctionCache):
+    """Machine code is loaded without setting up all that numba can compile, which takes a third of a second.
+
+    Kernels need its allocator alone. Those of other packages may call BLAS, which is part of what is left out.
+    """
+
+    _impl_class = _KernelCacheImpl
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """As numba's."""
+        numbas: Any = self
+        if numbas._py_func.__module__.rpartition(".")[0] != __package__:
+            return cast(Any, super()).load_overload(sig, target_context)
+        allocator: Any = rtsys
+        allocator.initialize(target_context)
+        with numbas._guard_against_spurious_io_errors():
+            return numbas._load_overload(sig, target_context)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_advice, find_alarms, verdict_of
+from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, verdict_of
 from rovgraph.diagnosis.constants import earth_rate_of, moved_constant, sds_moved
 from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
 from rovgraph.diagnosis.motion import excluded_interval, separation_of
@@ -24,6 +24,7 @@ from rovgraph.diagnosis.residuals import (
     too_large_in,
     too_small_in,
 )
+from rovgraph.diagnosis.statistics import find_advice, find_alarms
 from rovgraph.geometry import Array
 from rovgraph.inference.estimate import CalibrationEstimate
 from rovgraph.inference.filter import FilterEngine

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rovgraph.diagnosis import Statistic, find_alarms
+from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.constants import contradicted_constants_in, earth_rate_of
+from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.diagnosis.unstated_noise import unstated
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array

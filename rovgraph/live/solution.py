@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rovgraph.diagnosis import Alarm, Verdict
+from rovgraph.diagnosis.alarm import Alarm, Verdict
 from rovgraph.geometry import Array
 
 

@@ -17,8 +17,8 @@ from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
+from rovgraph.distributions import chi_square_quantile
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.layout import MOTION
@@ -337,7 +337,7 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
 @cache
 def loss_threshold(loss: str, dim: int) -> float:
     """Normalised length at which a loss bends: where 95 % of good measurements lie below."""
-    return float("inf") if loss == "none" else float(np.sqrt(chdtri(dim, 0.05)))
+    return float("inf") if loss == "none" else float(np.sqrt(chi_square_quantile(dim, 0.05)))
 
 
 def loss_and_weight(r: Array, loss: str) -> tuple[Array, Array]:

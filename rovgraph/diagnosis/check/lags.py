@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 
-from rovgraph.diagnosis.check.inertial import in_gap
+from rovgraph.diagnosis.check.inertial import fast_length, in_gap
 from rovgraph.geometry import Array, signed_permutations
 from rovgraph.rules import FOLLOWS, REACH_S
 
@@ -29,9 +28,9 @@ def correlate(a: Array, b: Array, first: int, last: int) -> Array:
     ----------
     first, last : lags, first < 0 <= last
     """
-    size = next_fast_len(max(len(b) - first, len(a) + last), real=True)
-    A, B = (rfft(v, size, axis=0).T for v in (a, b))
-    sums = irfft(A.conj()[:, None] * B, size, axis=-1)
+    size = fast_length(max(len(b) - first, len(a) + last))
+    A, B = (np.fft.rfft(v, size, axis=0).T for v in (a, b))
+    sums = np.fft.irfft(A.conj()[:, None] * B, size, axis=-1)
     return np.concatenate([sums[..., first:], sums[..., : last + 1]], axis=-1)
 
 
