@@ -38,9 +38,9 @@ def chi_square_quantile(count: int, chance: float) -> float:
 
 @cache
 def binomial_tail(most: int, trials: int, share: float) -> float:
-    """Chance of more than ``most`` successes in ``trials``, each of chance ``share``, 0 < share < 1."""
-    if not 0 <= most < trials:
-        return float(most < 0)
+    """Chance of more than ``most`` successes in ``trials``, each of chance ``share``, 0 <= share <= 1."""
+    if not (0 <= most < trials and 0.0 < share < 1.0):
+        return float(most < 0 or (most < trials and share > 0.0))
     odds, above = share / (1.0 - share), most + 1.0 > trials * share
     k = most + 1 if above else most
     more = np.arange(k, trials) if above else np.arange(k, 0, -1)

@@ -1,13 +1,39 @@
 """Acoustic positioning: the exchange's equation, its context, and dives whose truth is known."""
 
+import re
+import sys
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import pytest
+from dives import batch, same
 
+from rovgraph.dive import smooth
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
+from rovgraph.inference.chain_optimum import smooth_chain
+from rovgraph.inference.dead_reckoning import dead_reckon
+from rovgraph.inference.graph.places import smooth_graph
+from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
+from rovgraph.log import Log, Stream
 from rovgraph.model.calibration import LAYOUT, TABLE, USBL_MOUNT
+from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
+from rovgraph.problem.acoustics import Acoustics
+from rovgraph.problem.assembly import assembly_of
 from rovgraph.sensors import AcousticExchange
+from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.sound import SoundSpeedProfile
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import acoustics
+from acoustics import Setting, among_beacons, below_ship
+from fault_campaign.instruments import log_table
+from fault_campaign.judge import Dive
 
 VARIABLES = (
     *USBL_MOUNT, "usbl_arm", "sound_speed_scale", "usbl_range_offset", "usbl_direction_error", "usbl_range_error",
@@ -71,3 +97,191 @@ def _moved(s: State, variable: str, d: np.ndarray) -> State:
     if variable == "velocity":
         return State(s.R_nb, s.p_n, s.v_n + d, s.bias, s.calibration)
     return State(s.R_nb, s.p_n, s.v_n, s.bias, {**s.calibration, variable: s.calibration[variable] + d})
+
+
+# what a reply is made of
+
+
+def acoustics_of(config: Config, **ship: float) -> Acoustics:
+    """With a ship that goes north at 2 m/s and turns at 0.1 rad/s, rolling."""
+    found = Acoustics(config, {s: i for s, i in instruments(config).items() if s in ("usbl", "range")})
+    t = np.arange(0.0, 20.0, 0.5)
+    tables = {
+        "ship": np.column_stack([2.0 * t, np.zeros_like(t), np.full_like(t, np.nan)]),
+        "ship_heading": 0.1 * t[:, None],
+        "ship_tilt": np.column_stack([0.02 * t, np.zeros_like(t)]),
+    }
+    found.take_ship({name: Stream(name, (), t, data, np.arange(len(t))) for name, data in tables.items()})
+    return found
+
+
+def reply(time: float, length: float, bearing: float, elevation: float) -> Stream:
+    row = np.full((1, 10), np.nan)
+    row[0, [0, 2, 3]] = length, bearing, elevation
+    return Stream("usbl", (), np.array([time]), row, np.array([2]))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "answered", "heard"),
+    [("reply", 10.0 - 0.5 - 0.1, 10.0), ("transponder", 10.0 + 0.1, 10.7), ("arrival", 10.0 - 0.5 - 0.1, 10.0)],
+)
+def test_a_reply_stands_where_the_vehicle_answered_and_the_ship_where_it_heard(stamp, answered, heard):
+    config = parse_config(f"usbl: {{stamp: {stamp}, turn_around_s: 0.2, sound_speed_mps: 1500}}")
+    one = acoustics_of(config).exchanges(reply(10.0, 750.0, 0.3, 0.8), 0.0, Counter())
+    x = one.data[0, 6:]
+    np.testing.assert_allclose(one.time, answered)
+    np.testing.assert_allclose(x[at.HEARD : at.HEARD + 3], [2.0 * heard, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(x[at.ASKED : at.ASKED + 3], [2.0 * (heard - 1.2), 0.0, 0.0], atol=1e-9)
+    R = matrix_from_rpy([0.02 * heard, 0.0, 0.1 * heard])
+    np.testing.assert_allclose(x[at.FRAME : at.FRAME + 9].reshape(3, 3), R, atol=1e-9)
+    np.testing.assert_allclose(
+        x[at.SEEN : at.SEEN + 3], [np.cos(0.3) * np.cos(0.8), np.sin(0.3) * np.cos(0.8), np.sin(0.8)]
+    )
+
+
+def test_lever_arms_turn_with_the_ship_and_heights_count_from_the_waterline():
+    config = parse_config("{usbl: {lever_arm_m: [8, 0, 3]}, ship: {antenna_m: [-5, 0, -12]}}")
+    x = acoustics_of(config).exchanges(reply(10.0, 750.0, 0.3, 0.8), 0.0, Counter()).data[0, 6:]
+    R = matrix_from_rpy([0.2, 0.0, 1.0])
+    head, antenna = R @ [8.0, 0.0, 3.0], R @ [-5.0, 0.0, -12.0]
+    np.testing.assert_allclose(x[at.HEARD : at.HEARD + 3], [20.0 + (head - antenna)[0], (head - antenna)[1], head[2]])
+
+
+def test_replies_without_a_ship_near_are_counted_and_left_out():
+    left_out: Counter[tuple[str, str]] = Counter()
+    assert not len(acoustics_of(parse_config("")).exchanges(reply(40.0, 700.0, 0.3, 0.8), 0.0, left_out))
+    assert left_out == {("usbl", "without a position of the ship"): 1}
+
+
+def test_depth_that_is_given_is_not_used_again():
+    config = parse_config("usbl: {depth: given}")
+    sd = acoustics_of(config).exchanges(reply(10.0, 750.0, 0.3, 0.8), 0.0, Counter()).data[0, 3:6]
+    assert sd[2] > 1e5 > 1.0 > sd[0]
+
+
+# sound
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.8, 1.5])
+@pytest.mark.parametrize("seconds", [0.05, 0.6])
+def test_rays_and_means_are_those_of_the_closed_form_in_a_constant_gradient(angle, seconds):
+    g, begin = -0.05, 3.0
+    water = SoundSpeedProfile(np.array([0.0, 2000.0]), np.array([1540.0, 1540.0 + 2000.0 * g]))
+    (across,), (down,) = water.trace(begin, np.array([angle]), np.array([seconds]))
+    c1, c2 = 1540.0 + g * begin, 1540.0 + g * (begin + down)
+    assert np.arccosh(1.0 + g**2 * (across**2 + down**2) / (2.0 * c1 * c2)) / abs(g) == pytest.approx(seconds, abs=2e-8)
+    (mean,) = water.mean(np.array([begin]), np.array([begin + down]))
+    assert mean == pytest.approx(g * down / np.log(c2 / c1), abs=1e-3)
+
+
+# dives
+
+
+def log_of(dive: Dive) -> tuple[Log, Config]:
+    config = Config().changed(**dive.configuration)
+    return Log.from_frame(log_table(dive.streams), config), config
+
+
+@cache
+def short() -> tuple[Log, Config]:
+    """A minute below a ship, with four beacons that were surveyed."""
+    ranges = among_beacons(3, 4, 0.5, 1.0, 0.0, seconds=60.0)
+    ship = below_ship(Setting(seconds=60.0, depth=60.0), 3)
+    more = {name: ship.streams[name] for name in ("usbl", "ship", "ship_heading")}
+    config = {**ranges.configuration, **{k: ship.configuration[k] for k in ("usbl", "ship")}}
+    # the ship's replies are of another motion: engines agree all the same
+    return log_of(replace(ranges, streams=ranges.streams | more, configuration=config))
+
+
+def test_chain_and_gtsam_find_the_same_optimum_and_covariance():
+    log, config = short()
+    dive = batch(log, config)
+    states = dead_reckon(dive.problem, dive.initial, {n: b.mean for n, b in dive.initial.beliefs.items()})
+    chain, graph = (solve(dive.problem, dive.initial, states) for solve in (smooth_chain, smooth_graph))
+    np.testing.assert_allclose(chain.state.p_n, graph.state.p_n, atol=1e-5)
+    for name in ("usbl_yaw", "beacon_1", "sound_speed_scale"):
+        np.testing.assert_allclose(chain.state.calibration[name], graph.state.calibration[name], atol=1e-6)
+    a, b = (one.covariances()["pose"] for one in (chain, graph))
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-7)
+
+
+def test_a_log_taken_as_a_whole_gives_what_its_measurements_give_one_by_one():
+    log, config = short()
+    initial = initialise(log, config)
+    whole, some = assembly_of(initial), assembly_of(initial)
+    whole.take(log)
+    for m in log.measurements():
+        some.insert(m)
+        some.extend()
+    for assembly in (whole, some):
+        assembly.extend(finish=True)
+    a, b = whole.problem, some.problem
+    assert np.count_nonzero(a.which == a.sensors.index("usbl")) > 40
+    same(a.of, b.of)
+    same(a.rows, b.rows)
+
+
+def test_restored_from_its_state_an_assembly_goes_on_with_the_ship():
+    log, config = short()
+    initial, measurements, cut = initialise(log, config), [*log.measurements()], 4000
+    before, after = assembly_of(initial), assembly_of(initial)
+    for m in measurements[:cut]:
+        before.insert(m)
+        before.extend()
+    after.restore(before.state(len(before)))
+    for assembly in (before, after):
+        for m in measurements[cut:]:
+            assembly.insert(m)
+            assembly.extend()
+        assembly.extend(finish=True)
+    same(before.problem.rows[-100:], after.problem.rows[-100:])
+
+
+def rms(log_config: tuple[Log, Config], dive: Dive, **keys: object) -> tuple[float, object]:
+    found = smooth(*log_config, "smoothed", **keys)
+    track = found.estimates[0].trajectory
+    error = track.p_n - dive.motion.local(track.time)
+    return float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))), found
+
+
+def test_late_stamps_that_nobody_states_are_found_and_the_track_is_right():
+    dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False), 4)
+    error, found = rms(log_of(dive), dive)
+    late = next(e for e in found.estimates[0].calibration if e.label == "usbl_time_offset")
+    assert error < 0.6 and late.estimated and abs(late.value - 1.5) < max(0.1, 3.0 * late.sd)
+    assert any(re.search(r"its stamps are 1\.[45]\d s late", line) for line in found.assumptions)
+
+
+def test_a_healthy_dive_is_trusted_and_has_no_late_stamps():
+    dive = below_ship(Setting(seconds=120.0), 5)
+    error, found = rms(log_of(dive), dive)
+    assert error < 0.6 and found.verdict == "trusted"
+    assert not any("late" in line or "turn by" in line for line in found.assumptions)
+
+
+def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told():
+    dive = acoustics.one_beacon(1, straight=False, seconds=700.0)
+    _, found = rms(log_of(dive), dive)
+    beacon = {e.label: e for e in found.estimates[0].calibration}
+    assert found.verdict == "trusted" and beacon["beacon_1_north"].sd < 12.0
+    dive = acoustics.one_beacon(0, straight=True, seconds=250.0)
+    _, found = rms(log_of(dive), dive)
+    beacon = {e.label: e for e in found.estimates[0].calibration}
+    assert found.verdict == "doubtful" and "mirrored" in found.warnings[0]
+    assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+
+
+@pytest.mark.slow
+def test_dives_below_a_ship_are_consistent_and_a_wrong_sd_fails():
+    nees = {1.0: [], 0.2: []}
+    for seed in range(20):
+        dive = below_ship(Setting(seconds=120.0, dvl=False), seed)
+        for factor in nees:
+            scaled = {"range_sd_m": 0.2 * factor, "angle_sd_deg": 0.5 * factor}
+            log, config = log_of(dive)
+            config = config.changed(usbl=scaled, graph={"find_noise": False})
+            track = smooth(log, config, "smoothed").estimates[0].trajectory
+            d = (track.p_n - dive.motion.local(track.time))[::10, :2]
+            P = track.cov_p[::10, :2, :2]
+            nees[factor].append(float(np.einsum("ni,nij,nj->n", d, np.linalg.inv(P), d).mean() / 2.0))
+    assert 0.3 < np.mean(nees[1.0]) < 1.6 < np.mean(nees[0.2])
