@@ -1,7 +1,9 @@
 """Small simulated dives for the tests, as `Log` objects that never touch a file."""
 
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -141,6 +143,34 @@ def started(case: Simulated, **sections: Mapping[str, Any]) -> Config:
     start = {"north_m": north, "east_m": east, "down_m": down}
     start |= {"roll_deg": rpy[0], "pitch_deg": rpy[1], "heading_deg": rpy[2]}
     return changed(changed(case.config, start=start), **sections)
+
+
+def campaign_log(dive: Any) -> tuple[Log, Config]:
+    """A dive of the fault campaign's simulator."""
+    from fault_campaign.instruments import log_table
+
+    config = Config().changed(**dive.configuration)
+    return Log.from_frame(log_table(dive.streams), config), config
+
+
+@cache
+def below_a_ship() -> tuple[Log, Config]:
+    """A minute with a USBL, and ranges to four beacons that were surveyed."""
+    sys.path.insert(0, str(FilePath(__file__).parents[1] / "benchmarks"))
+    from acoustics import Setting, below_ship
+    from fault_campaign.acoustic import Acoustic, Ship, System, ranges
+    from fault_campaign.campaign import merge
+
+    dive, system, rng = below_ship(Setting(seconds=60.0, depth=60.0), 3), System(rate=1.0), np.random.default_rng(3)
+    places = {
+        "1": (40.0, 10.0, 80.0),
+        "2": (-30.0, 50.0, 82.0),
+        "3": (-20.0, -60.0, 79.0),
+        "wreck": (70.0, -20.0, 81.0),
+    }
+    config = merge(dive.configuration, Acoustic(Ship(), system).ranges(places, 0.5))
+    streams = dive.streams | {"range": ranges(dive.motion, places, system, rng)}
+    return campaign_log(replace(dive, streams=streams, configuration=config))
 
 
 def batch(log: Log, config: Config) -> BatchSmoother:

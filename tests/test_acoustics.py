@@ -3,19 +3,14 @@
 import re
 import sys
 from collections import Counter
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from dives import batch, same
+from dives import below_a_ship, campaign_log, same
 
 from rovgraph.dive import smooth
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
-from rovgraph.inference.chain_optimum import smooth_chain
-from rovgraph.inference.dead_reckoning import dead_reckon
-from rovgraph.inference.graph.places import smooth_graph
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Stream
@@ -31,8 +26,7 @@ from rovgraph.sensors.sound import SoundSpeedProfile
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import acoustics
-from acoustics import Setting, among_beacons, below_ship
-from fault_campaign.instruments import log_table
+from acoustics import Setting, below_ship
 from fault_campaign.judge import Dive
 
 VARIABLES = (
@@ -177,36 +171,8 @@ def test_rays_and_means_are_those_of_the_closed_form_in_a_constant_gradient(angl
 # dives
 
 
-def log_of(dive: Dive) -> tuple[Log, Config]:
-    config = Config().changed(**dive.configuration)
-    return Log.from_frame(log_table(dive.streams), config), config
-
-
-@cache
-def short() -> tuple[Log, Config]:
-    """A minute below a ship, with four beacons that were surveyed."""
-    ranges = among_beacons(3, 4, 0.5, 1.0, 0.0, seconds=60.0)
-    ship = below_ship(Setting(seconds=60.0, depth=60.0), 3)
-    more = {name: ship.streams[name] for name in ("usbl", "ship", "ship_heading")}
-    config = {**ranges.configuration, **{k: ship.configuration[k] for k in ("usbl", "ship")}}
-    # the ship's replies are of another motion: engines agree all the same
-    return log_of(replace(ranges, streams=ranges.streams | more, configuration=config))
-
-
-def test_chain_and_gtsam_find_the_same_optimum_and_covariance():
-    log, config = short()
-    dive = batch(log, config)
-    states = dead_reckon(dive.problem, dive.initial, {n: b.mean for n, b in dive.initial.beliefs.items()})
-    chain, graph = (solve(dive.problem, dive.initial, states) for solve in (smooth_chain, smooth_graph))
-    np.testing.assert_allclose(chain.state.p_n, graph.state.p_n, atol=1e-5)
-    for name in ("usbl_yaw", "beacon_1", "sound_speed_scale"):
-        np.testing.assert_allclose(chain.state.calibration[name], graph.state.calibration[name], atol=1e-6)
-    a, b = (one.covariances()["pose"] for one in (chain, graph))
-    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-7)
-
-
 def test_a_log_taken_as_a_whole_gives_what_its_measurements_give_one_by_one():
-    log, config = short()
+    log, config = below_a_ship()
     initial = initialise(log, config)
     whole, some = assembly_of(initial), assembly_of(initial)
     whole.take(log)
@@ -222,7 +188,7 @@ def test_a_log_taken_as_a_whole_gives_what_its_measurements_give_one_by_one():
 
 
 def test_restored_from_its_state_an_assembly_goes_on_with_the_ship():
-    log, config = short()
+    log, config = below_a_ship()
     initial, measurements, cut = initialise(log, config), [*log.measurements()], 4000
     before, after = assembly_of(initial), assembly_of(initial)
     for m in measurements[:cut]:
@@ -246,7 +212,7 @@ def rms(log_config: tuple[Log, Config], dive: Dive, **keys: object) -> tuple[flo
 
 def test_late_stamps_that_nobody_states_are_found_and_the_track_is_right():
     dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False), 4)
-    error, found = rms(log_of(dive), dive)
+    error, found = rms(campaign_log(dive), dive)
     late = next(e for e in found.estimates[0].calibration if e.label == "usbl_time_offset")
     assert error < 0.6 and late.estimated and abs(late.value - 1.5) < max(0.1, 3.0 * late.sd)
     assert any(re.search(r"its stamps are 1\.[45]\d s late", line) for line in found.assumptions)
@@ -254,18 +220,18 @@ def test_late_stamps_that_nobody_states_are_found_and_the_track_is_right():
 
 def test_a_healthy_dive_is_trusted_and_has_no_late_stamps():
     dive = below_ship(Setting(seconds=120.0), 5)
-    error, found = rms(log_of(dive), dive)
+    error, found = rms(campaign_log(dive), dive)
     assert error < 0.6 and found.verdict == "trusted"
     assert not any("late" in line or "turn by" in line for line in found.assumptions)
 
 
 def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told():
     dive = acoustics.one_beacon(1, straight=False, seconds=700.0)
-    _, found = rms(log_of(dive), dive)
+    _, found = rms(campaign_log(dive), dive)
     beacon = {e.label: e for e in found.estimates[0].calibration}
     assert found.verdict == "trusted" and beacon["beacon_1_north"].sd < 12.0
     dive = acoustics.one_beacon(0, straight=True, seconds=250.0)
-    _, found = rms(log_of(dive), dive)
+    _, found = rms(campaign_log(dive), dive)
     beacon = {e.label: e for e in found.estimates[0].calibration}
     assert found.verdict == "doubtful" and "mirrored" in found.warnings[0]
     assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
@@ -278,7 +244,7 @@ def test_dives_below_a_ship_are_consistent_and_a_wrong_sd_fails():
         dive = below_ship(Setting(seconds=120.0, dvl=False), seed)
         for factor in nees:
             scaled = {"range_sd_m": 0.2 * factor, "angle_sd_deg": 0.5 * factor}
-            log, config = log_of(dive)
+            log, config = campaign_log(dive)
             config = config.changed(usbl=scaled, graph={"find_noise": False})
             track = smooth(log, config, "smoothed").estimates[0].trajectory
             d = (track.p_n - dive.motion.local(track.time))[::10, :2]

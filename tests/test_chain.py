@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dives import altered, batch, changed, falcon, interrupted, simulated, started
+from dives import altered, batch, below_a_ship, changed, falcon, interrupted, simulated, started
 
 from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.inference import chain_optimum, gauss_newton
@@ -29,7 +29,8 @@ from rovgraph.simulate import simulated as driven
 from rovgraph.simulate.files import write_log
 
 EXACT = 1e-10  # decrease of the cost that is left when both stop here
-UNUSED = "dvl_altitude", "vehicle_tilt"  # the first measures nothing of the vehicle, the other where there is no IMU
+# these measure nothing of the vehicle, or where there is no IMU, or have a dive of their own
+UNUSED = "dvl_altitude", "vehicle_tilt", "ship", "ship_heading", "ship_tilt", "usbl", "range"
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0}
 WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
 
@@ -105,6 +106,12 @@ def every_sensor() -> Case:
     return Log(log.source, {**log.streams, **more}), config
 
 
+def acoustic() -> Case:
+    log, config = below_a_ship()
+    exact = {name: {"estimate": False} for name, variable in TABLE.items() if variable.considered}
+    return log, config.changed(calibration=exact)
+
+
 SCENARIOS: dict[str, Callable[[], Case]] = {
     "both compasses and misalignment": both_compasses,
     "calibration that walks": walking,
@@ -114,6 +121,7 @@ SCENARIOS: dict[str, Callable[[], Case]] = {
     "IMU outage": outage,
     "outliers": outliers,
     "every sensor but places": every_sensor,
+    "acoustic positioning": acoustic,
 }
 
 
@@ -133,6 +141,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
 
 IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "every sensor but places": lambda best: {*best.blocks} == {*SENSORS} - {"imu", "place", *UNUSED},
+    "acoustic positioning": lambda best: {"usbl", "range"} <= set(best.blocks),
     "both compasses and misalignment": lambda best: {"mag", "dvl_heading"} <= set(best.blocks),
     "calibration that walks": lambda best: best.chain.layout.d > 15,
     "errors that last": lambda best: len(best.chain.unknowns.time_constants) == 3,
