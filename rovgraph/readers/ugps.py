@@ -1,7 +1,7 @@
 """Records of a Water Linked Underwater GPS (UGPS G2), as loggers poll them from its HTTP interface: CSV or JSON.
 
-An answer of ``position/acoustic/raw`` (or ``filtered``) has ``position_valid``, ``x``, ``y``, ``z`` [m], ``std``, and of
-each receiver ``receiver_distance`` [m], ``receiver_valid``, ``receiver_nsd``, ``receiver_rssi``; one of
+An answer of ``position/acoustic/raw`` (or ``filtered``) has ``position_valid``, ``x``, ``y``, ``z`` [m], ``std``, and
+of each receiver ``receiver_distance`` [m], ``receiver_valid``, ``receiver_nsd``, ``receiver_rssi``; one of
 ``position/master`` has ``lat``, ``lon``, ``orientation`` [deg] (-1 = unknown) and ``fix_quality`` (0 = no fix) of the
 topside. x is forward, y starboard of the antenna, z the depth that the locator's own sensor measures. No answer has a
 time: stamps are the logger's. Polled faster than the locator sends, an answer is given again. While a position is not
@@ -33,7 +33,7 @@ RECORDER = "recorder"
 VALID = ("position_valid", "acoustic_valid", "acoustic_position_valid")
 TIMES = ("timestamp", "time")
 POSITIONS, DISTANCES = "x, y, z", "receiver_distance"  # sources of usbl and range
-DEPTH_TWICE = "z is the depth that the locator's own sensor measures: where the log has the same sensor's depth, leave one of them out"
+DEPTH_TWICE = "z is the locator's own depth: beside depth of the same sensor it is one measurement taken twice"
 
 
 @dataclass(frozen=True)
