@@ -13,10 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from recordings import check_refused_or_whole, close, first, read
-from wire import sentence
+from wire import Heard, decoded, sentence
 
 from rovgraph.errors import InputError
-from rovgraph.log.streams import label_number
+from rovgraph.live.message import GEODETIC, SHIP_GEODETIC, Message
+from rovgraph.live.sources.nmea import nmea
+from rovgraph.log.streams import STREAMS, label_number
+from rovgraph.model.config import Config
 from rovgraph.readers.acoustic_channels import from_utm, on_ships_grid
 from rovgraph.readers.acoustic_sentences import (
     Directions,
@@ -510,3 +513,94 @@ def test_changed_bytes_raise_nothing_but_a_refusal(changes, tmp_path_factory):
     for place, new in changes:
         data[place % len(data) : place % len(data) + 2] = new
     check_refused_or_whole(read, bytes(data), tmp_path_factory.getbasetemp())
+
+
+# Live: the same readings
+
+
+def live(data: bytes, config: Config, recorded: bool = True) -> tuple[list[Message], Heard]:
+    heard = Heard()
+    return decoded(nmea("n", heard, config, recorded), data, arrival=NOON), heard
+
+
+def of(messages: list[Message], sensor: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values of a sensor's readings."""
+    found = [
+        (m.arrival if m.stamp is None else m.stamp, r.values)
+        for m in messages
+        for r in m.readings
+        if r.sensor == sensor
+    ]
+    return np.array([time for time, _ in found]), np.array([values for _, values in found])
+
+
+SNS = "PSIMSNS,1200??.35,B01,1,1,2.0,-1.0,0.0,91.0,,,0.0,,M"
+
+
+def test_live_gives_what_the_file_gives(tmp_path):
+    data = dive(SSB, SNS)
+    config = Config().changed(usbl={"frame": "ship"})
+    messages, heard = live(data, config)
+    usbl = first(read(data, tmp_path), "usbl").columns
+    time, values = of(messages, "usbl")
+    close(time, usbl["time"])
+    for name, column in zip(STREAMS["usbl"], values.T, strict=True):
+        close(column, usbl.get(name, np.full(20, np.nan)))
+    assert len(of(messages, GEODETIC)[0]) == len(of(messages, "ahrs")[0]) == 0
+    ship = first(read(data, tmp_path), "ship").columns
+    close(of(messages, SHIP_GEODETIC)[1][:, 0], ship["ship_lat"])
+    close(of(messages, "ship_heading")[1][-1, 0], math.radians(91.0))  # of the pings, once they are heard
+    close(of(messages, "ship_tilt")[1][0], np.radians([2.0, -1.0]))
+    assert heard.kinds.keys() <= {"switched"}
+
+
+@pytest.mark.parametrize("change", [(",M,10", ",F,10"), ("", "")])
+def test_live_replies_are_fixes_where_they_are_filtered_or_their_axes_are_not_stated(change, tmp_path):
+    data = dive(SSB.replace(*change), SNS)
+    messages, heard = live(data, Config().changed(usbl={"frame": "ship"}) if change[0] else Config())
+    file = first(read(data, tmp_path, fix="PSIMSSB B01"), "fix").columns
+    time, values = of(messages, GEODETIC)
+    at_start = 0 if change[0] else 1  # until an acoustic sentence is heard, a fix is the vehicle's
+    close(time[-19:], file["time"][-19:], atol=1e-3)
+    close(values[-18:, :2], np.column_stack([file["fix_lat"], file["fix_lon"]])[-18:], atol=1e-9)
+    assert len(of(messages, "usbl")[0]) == 0 and len(time) <= 20 + at_start
+    assert any("is a fix" in text for text in heard.texts)
+
+
+def test_live_no_replies_and_predicted_positions_are_told_and_left_out():
+    lines = (
+        SSB.replace("A,,", "A,NRy,"),
+        SSB.replace(",M,10", ",P,10"),
+        HIPAP[1:].partition("*")[0].replace("A,,", "V,,"),
+    )
+    messages, heard = live(dive(*lines, seconds=5), Config().changed(usbl={"frame": "ship"}))
+    assert len(of(messages, "usbl")[0]) == len(of(messages, GEODETIC)[0]) == 0
+    assert heard.kinds["no reply"] == 5 and heard.kinds["no position"] == 10
+
+
+def test_live_positions_on_earth_are_fixes_and_the_gaps_is_the_ship():
+    lines = [
+        "PTSAG,#1,120001.200,02,03,2024,0,5000.00000,N,00806.00000,E,F,2.9,1,9999.0",
+        "PTSAG,#2,120001.200,02,03,2024,4,5000.10000,N,00806.20000,E,F,30.0,1,9999.0",
+        "PTSAX,#3,120001.200,02,03,2024,4,100.0,-20.0,F,30.0,1,9999.0",
+    ]
+    messages, _ = live(b"".join(sentence(line) for line in lines), Config(), recorded=False)
+    assert [r.sensor for m in messages for r in m.readings] == [SHIP_GEODETIC, GEODETIC]
+    close(of(messages, GEODETIC)[0] - NOON, [1.2])
+
+
+def test_live_a_modems_line_tells_its_own_time():
+    messages, _ = live(MODEM.encode() + b"\r\n", Config(), recorded=False)
+    (message,) = messages
+    assert (message.clock, message.arrival) == ("modem", NOON)
+    assert message.stamp == pytest.approx(10446.534643) and message.latency == pytest.approx(0.457338)
+    (reading,) = message.readings
+    assert reading.values.shape == (len(STREAMS["usbl"]),)
+    close(reading.values[STREAMS["usbl"].index("usbl_beacon")], 3.0)
+
+
+def test_live_another_transponder_is_left_out_of_fixes():
+    data = dive(SSB, SSB.replace("B01", "B02"), SNS, seconds=5)
+    config = Config().changed(usbl={"beacon": "B02"}, ship={"heading_deg": 0.0})
+    messages, _ = live(data, config)
+    assert len(of(messages, GEODETIC)[0]) == 5

@@ -18,7 +18,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
-from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, precedence
 from rovgraph.model.config import Config, Mag
@@ -27,7 +27,7 @@ from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.instruments import instruments
 
-_STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
+_STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
 
@@ -101,11 +101,11 @@ class Intake:
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard at that time."""
         sensor, values = reading
-        if sensor == GEODETIC:
+        if sensor in ON_EARTH:
             if self.origin is None:
                 self.origin = float(values[0]), float(values[1])
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
-            sensor, values = "fix", np.array([north, east, values[2]])
+            sensor, values = _STREAM[sensor], np.array([north, east, values[2]])
         elif sensor == "fix":
             self._local = True
         elif sensor == "mag":

@@ -6,10 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.log.streams import LAT_LON, THRUSTER
+from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, THRUSTER
 from rovgraph.sensors import SENSORS
 
-GEODETIC = "geodetic"  # a fix in latitude, longitude [deg], sd [m]: becomes "fix" once there is an origin
+# positions in latitude, longitude [deg] and sd [m], which become "fix" and "ship" once there is an origin
+GEODETIC, SHIP_GEODETIC = "geodetic", "ship_geodetic"
+ON_EARTH = {GEODETIC: (*LAT_LON, "fix_sd"), SHIP_GEODETIC: (*SHIP_LAT_LON, "ship_sd")}  # their columns
 
 
 class Reading(NamedTuple):
@@ -17,7 +19,7 @@ class Reading(NamedTuple):
 
     Attributes
     ----------
-    sensor : key of `SENSORS` or `GEODETIC`
+    sensor : key of `SENSORS` or of `ON_EARTH`
     values : ndarray, shape (k,), SI, the stream's columns; what is optional and absent is NaN
         (``dvl_valid``: 1)
     """
@@ -64,9 +66,11 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
         lost = sensor == "dvl" and cells.get("dvl_valid") == 0.0  # a ping without bottom lock needs no velocities
         if lost or all(c in cells for c in known.required):
             values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in known.column_names])
-            found.append(Reading(sensor, values))
-    if all(name in cells for name in LAT_LON):
-        found.append(Reading(GEODETIC, np.array([*(cells[n] for n in LAT_LON), cells.get("fix_sd", np.nan)])))
+            if known.complete is None or known.complete(values[None])[0]:
+                found.append(Reading(sensor, values))
+    for sensor, (lat, lon, sd) in ON_EARTH.items():
+        if lat in cells and lon in cells:
+            found.append(Reading(sensor, np.array([cells[lat], cells[lon], cells.get(sd, np.nan)])))
     thrusters = [f"thruster_{k + 1}" for k in range(sum(THRUSTER.fullmatch(n) is not None for n in cells))]
     if thrusters and all(name in cells for name in thrusters):
         found.append(Reading("thruster", np.array([cells[n] for n in thrusters])))
