@@ -3,14 +3,23 @@
 import csv
 import io
 import json
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from recordings import check_refused_or_whole, close, first, read
+from wire import Heard
 
 from rovgraph.errors import InputError
+from rovgraph.live.message import SHIP_GEODETIC
+from rovgraph.live.sources import open_source
+from rovgraph.live.sources.source import LinkSource
+from rovgraph.live.sources.ugps import UgpsPolling, ugps
+from rovgraph.log.streams import STREAMS
+from rovgraph.model.config import Config
 
 # of Pier 59, Seattle, 2023-06-05, wl_ugps_acoustic_analysis; a row of each kind
 REAL = b"""\
@@ -142,3 +151,65 @@ def test_changed_bytes_raise_nothing_but_a_refusal(changes, form, tmp_path_facto
     for place, new in changes:
         data[place % len(data) : place % len(data) + 2] = new
     check_refused_or_whole(read, bytes(data), tmp_path_factory.getbasetemp())
+
+
+class Topside(BaseHTTPRequestHandler):
+    """Answers with the rows in their order, the third by HTTP 500, then with the last one for ever."""
+
+    asked = 0
+
+    def do_GET(self) -> None:
+        if self.path == "/api/v1/position/master":
+            answer: object = MASTER
+        else:
+            assert self.path == "/api/v1/position/acoustic/raw"
+            k = Topside.asked
+            Topside.asked += 1
+            if k == 2:
+                self.send_error(500)
+                return
+            row = ROWS[min(k - (k > 2), len(ROWS) - 1)]
+            answer = nested(row)["position/acoustic/raw"]
+        body = json.dumps(answer).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_live_answers_are_polled_through_http_500_and_silence():
+    Topside.asked = 0
+    heard, stop = Heard(), threading.Event()
+    config = Config().changed(usbl={"frame": "ship"})
+    with ThreadingHTTPServer(("127.0.0.1", 0), Topside) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        link = UgpsPolling("127.0.0.1", server.server_address[1], 50.0, heard)
+        messages = LinkSource("u", link, ugps("u", heard, config)).messages(stop)
+        found = []
+        for message in messages:
+            found.append(message)
+            if sum(r.sensor == "usbl" for m in found for r in m.readings) == 3 and Topside.asked > 8:
+                break
+            if Topside.asked > 200:
+                break
+        server.shutdown()
+    usbl = np.array([r.values for m in found for r in m.readings if r.sensor == "usbl"])
+    x = STREAMS["usbl"].index("usbl_x")
+    close(usbl[:, x : x + 3].T, [[7.112783908843994, 7.162590980529785, 6.845580101013184],
+                                 [1.7669514417648315, 1.785159707069397, 2.3571224212646484],
+                                 [0.688177227973938, 0.6419087052345276, 0.9583797454833984]])  # fmt: skip
+    close(next(r.values for m in found for r in m.readings if r.sensor == SHIP_GEODETIC)[:2], [47.6, -122.3])
+    assert heard.kinds["HTTP 500"] == 1 and heard.kinds["not valid"] == 1
+    late = threading.Timer(0.3, stop.set)
+    late.start()
+    assert list(messages) == []
+    assert heard.kinds["unreachable"] >= 1 and "frame" not in heard.kinds
+
+
+@pytest.mark.parametrize("url", ["ugps:192.168.2.94", "ugps:http://", "ugps:http://host?rate=0", "ugps:tcp://host:1"])
+def test_addresses_of_no_interface_are_refused(url):
+    with pytest.raises(InputError, match="ugps"):
+        open_source(url)

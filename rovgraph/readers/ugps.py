@@ -93,6 +93,8 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
     """Names with those of the answers that they stand in before them."""
     out: dict[str, Any] = {}
     for name, value in row.items():
+        if value is None:
+            continue
         if isinstance(value, dict):
             of = next((answer for answer in _ANSWERS if answer in name), name)
             out |= {f"{of}_{inner}": each for inner, each in value.items()}
