@@ -33,6 +33,7 @@ AXES = {
     "north": "north, east, down by the ship's compass",
     "transducer": "forward, starboard, down of the head",
 }
+LAST = ("PTSAH", "PSONALL")  # of attitudes
 INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter turns them into PTSAG with what it knows of the ship
 BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
 AXES = {
@@ -40,6 +41,7 @@ AXES = {
     "north": "north, east, down by the ship's compass",
     "transducer": "forward, starboard, down of the head",
 }
+LAST = ("PTSAH", "PSONALL")  # of attitudes
 INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter makes PTSAG of them with what it knows of the ship
 BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
 NAMES = ("PSIM", "PTSA", "PSON", "USRTH", "USBL", "MicronNav", "SeaTrac")  # of acoustic sentences
@@ -265,7 +267,7 @@ class ShipsFile:
             kind: _in_time(((t, (a.heading, a.roll, a.pitch)) for t, a in rows), names)
             for kind, rows in self.heard.attitudes.items()
         }
-        last = {kind: told.pop(kind) for kind in ("PTSAH", "PSONALL") if kind in told}
+        last = {kind: told.pop(kind) for kind in [*told] if kind in LAST}
         for channel in others:
             if channel.sensor == "ahrs" and channel.source.endswith(TRUE):
                 told[channel.source] = {name.removeprefix("ahrs_"): v for name, v in channel.columns.items()}
@@ -410,8 +412,8 @@ class ShipsFile:
         return channels, {"calibration": {"fix_error": {"estimate": True}}}
 
     def _is_filtered(self, name: str) -> bool:
-        replies = (r for rows in self.heard.replies.values() for _, r in rows if r.name == name)
-        return any(told.filtered for told in (*replies, *(p for _, p in self.heard.positions.get(name, ()))))
+        replies = any(r.filtered for rows in self.heard.replies.values() for _, r in rows if r.name == name)
+        return replies or any(position.filtered for _, position in self.heard.positions.get(name, ()))
 
     def _placed(self) -> dict[str, Channel]:
         """Fixes of replies that are added to the ship's position, by name."""

@@ -211,7 +211,8 @@ def _recording(
     left["records", "without a time"] += len(answers) - len(timed)
     if not timed:
         raise InputError(f"{path}: no record has a time; log the time of each answer as timestamp, in s since 1970")
-    fresh, repeats = [], 0
+    fresh: list[UgpsAnswer] = []
+    repeats = 0
     for answer in timed:
         if fresh and answer.said == fresh[-1].said:
             repeats += 1

@@ -137,7 +137,7 @@ class NmeaDecoder:
             self._ship.append((time, float(reading.values[0]), float(reading.values[1])))
             return (Reading(SHIP_GEODETIC, reading.values),)
         yaw, roll, pitch = reading.values.tolist()
-        return self._attitude_of_ship(wrap_angle(yaw + math.radians(self._declination)), roll, pitch, time)
+        return self._attitude_of_ship(float(wrap_angle(yaw + math.radians(self._declination))), roll, pitch, time)
 
     def _attitude_of_ship(self, heading: float, roll: float, pitch: float, time: float) -> tuple[Reading, ...]:
         found = []
