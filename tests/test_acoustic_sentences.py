@@ -17,6 +17,7 @@ from wire import Heard, decoded, sentence
 
 from rovgraph.errors import InputError
 from rovgraph.live.message import GEODETIC, SHIP_GEODETIC, Message
+from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.log.streams import STREAMS, label_number
 from rovgraph.model.config import Config
@@ -604,3 +605,15 @@ def test_live_another_transponder_is_left_out_of_fixes():
     config = Config().changed(usbl={"beacon": "B02"}, ship={"heading_deg": 0.0})
     messages, _ = live(data, config)
     assert len(of(messages, GEODETIC)[0]) == 5
+
+
+def test_json_lines_have_the_ship_and_rows_without_a_reply_give_none():
+    lines = (
+        b'{"time": 1, "depth": 3.0}\n'
+        b'{"time": 2, "usbl_x": 1, "usbl_y": 2, "usbl_z": 3, "usbl_beacon": "B01"}\n'
+        b'{"time": 2.1, "usbl_x": 1, "usbl_y": 2}\n'
+        b'{"time": 3, "ship_lat": 50.0, "ship_lon": 8.1, "ship_heading": 1.5}\n'
+        b'{"time": 4, "ship_lat": 0, "ship_lon": 0}\n'
+    )
+    messages = decoded(json_lines("u", Heard(), Config()), lines)
+    assert [[r.sensor for r in m.readings] for m in messages] == [["depth"], ["usbl"], ["ship_heading", SHIP_GEODETIC]]
