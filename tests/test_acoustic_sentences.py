@@ -417,6 +417,17 @@ def test_north_up_needs_no_heading(tmp_path):
     assert [c.sensor for c in recording.channels] == ["usbl", "ship"]
 
 
+@pytest.mark.parametrize(("extra", "said"), [("D,29.8", True), ("N,", False)])
+def test_a_depth_of_the_transponders_own_sensor_is_told(extra, said, tmp_path):
+    recording = read(dive(SSB.replace("N,,", f"{extra},")), tmp_path)
+    assert any("taken twice" in line for line in recording.warnings) == said
+
+
+def test_a_file_with_unknown_layouts_alone_is_refused_by_their_names(tmp_path):
+    with pytest.raises(InputError, match=r"PSONDEP: 3 \(its layout is not known; record PSONLLD"):
+        read(sentence("PSONDEP,120000.00,2401,99.9") * 3, tmp_path)
+
+
 def test_filtered_positions_are_raw_only_where_that_is_chosen(tmp_path):
     data = dive(SSB.replace(",M,10", ",F,10"))
     assert first(read(data, tmp_path), "fix").source == "PSIMSSB B01"

@@ -45,6 +45,7 @@ LAST = ("PTSAH", "PSONALL")  # of attitudes
 INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter makes PTSAG of them with what it knows of the ship
 BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
 NAMES = ("PSIM", "PTSA", "PSON", "USRTH", "USBL", "MicronNav", "SeaTrac")  # of acoustic sentences
+TWICE = "beside depth of the same sensor it is one measurement taken twice"
 NO_GRID = "on a grid that is not stated, and not UTM of the ship's zone within 20 km of her"
 AS_UTM = "is on a grid that it does not state; it is taken as UTM on WGS 84 in the ship's zone"
 
@@ -361,6 +362,8 @@ class ShipsFile:
                 f"{BRIDGE} is a bridge that writes x of a Water Linked antenna where starboard belongs: where x is "
                 "forward, as of a G2, forward and starboard are exchanged; record the positions of its API instead"
             )
+        if any(reply.sensed for reply in used):
+            self.said.append(f"{used[0].name} has the depth of the transponder's own sensor: {TWICE}")
         if any(reply.filtered for reply in used):
             self.said.append(
                 f"{used[0].name} is filtered by the acoustic system, so its errors last: it follows turns late"

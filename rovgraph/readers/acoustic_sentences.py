@@ -6,11 +6,12 @@ down; what is no reply is refused with its reason. Fields count from 1 after the
 
 ======================  ===============================================================================================
 ``PSIMSSB``             1 time, UTC or local, 2 transponder, 3 status, 4 error, 5 coordinates, 6 orientation, 7 filter,
-                        8 to 10 x, y, depth, 11 expected accuracy. x is starboard and y forward (H), north and east (N),
-                        east and north (E). Status A may stand without a reply: an error code (NRy) means that there was
-                        none, and the position is then zero or extrapolated, as it is with filter P (predicted). M is
-                        measured, F filtered, which follows turns late. Coordinates D are latitude, N or S, longitude, E
-                        or W in the place of x and y, so that what follows stands two fields later.
+                        8 to 10 x, y, depth, 11 expected accuracy, 12 what follows (D: a depth sensor's). x is
+                        starboard and y forward (H), north and east (N), east and north (E). Status A may stand
+                        without a reply: an error code (NRy) means that there was none, and the position is then zero
+                        or extrapolated, as it is with filter P (predicted). M is measured, F filtered, which follows
+                        turns late. Coordinates D are latitude, N or S, longitude, E or W in the place of x and y, so
+                        that what follows stands two fields later.
 ``PSIMSNS``             1 time, 2 transponder, 5 roll, 6 pitch, 8 heading of the ship at a ping
 ``PSIMLBP``             1 time, 2 array, 4 status, 5 coordinates, 6 to 8 x, y, depth, 9, 10 semi-axes
 ``PTSAG``               1 frame, 2 time, 3 to 5 day, month, year, 6 number (0 the ship), 7 to 10 latitude and longitude,
@@ -96,6 +97,7 @@ class Reply:
     columns : of a log's `usbl` -> value
     sd : of the position it gives, NaN = not stated [m]
     filtered : by the system
+    sensed : its depth is that of the transponder's own sensor
     """
 
     kind: str
@@ -105,6 +107,7 @@ class Reply:
     columns: Mapping[str, float]
     sd: float = math.nan
     filtered: bool = False
+    sensed: bool = False
 
     @property
     def name(self) -> str:
@@ -323,7 +326,7 @@ def _psimssb(cells: Cells) -> Told:
     frame, ahead, aside = _along_axes(orientation, x, y)
     sd = _accuracy(cells[11])
     columns = _with_angle_sd(_cartesian(ahead, aside, depth), sd)
-    return Reply(kind, beacon, when, frame, columns, sd, smoothed)
+    return Reply(kind, beacon, when, frame, columns, sd, smoothed, cells[12] == "D")
 
 
 def _psimsns(cells: Cells) -> Told:
@@ -386,7 +389,8 @@ def _ptsa_relative(cells: Cells) -> Told:
     if cells[11] not in ("1", "2"):
         raise Refused(NO_POSITION, "without a depth")
     x, y, depth = _numbers(cells, 7, 8, 10)
-    return Reply(cells[0], beacon, when, "ship" if cells[0] == "PTSAX" else "north", _cartesian(x, y, depth))
+    frame: Frame = "ship" if cells[0] == "PTSAX" else "north"
+    return Reply(cells[0], beacon, when, frame, _cartesian(x, y, depth), sensed=cells[11] == "2")
 
 
 def _ptsah(cells: Cells) -> Told:
