@@ -215,7 +215,11 @@ def test_a_ship_at_rest_keeps_its_fixes(tmp_path):
     recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path, fix="PSIMSSB M17")
     assert len(first(recording, "fix").columns["time"]) == 300
     measured = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
-    assert [len(first(measured, sensor).columns["time"]) for sensor in ("usbl", "ship", "ship_heading")] == [300, 300, 299]
+    assert [len(first(measured, sensor).columns["time"]) for sensor in ("usbl", "ship", "ship_heading")] == [
+        300,
+        300,
+        299,
+    ]
     assert len(next(c for c in recording.channels if c.source == "GPGGA").columns["time"]) == 300
 
 

@@ -570,9 +570,9 @@ _MOST_FIELDS = 30
 def acoustic_sentence(line: bytes) -> tuple[str, str] | None:
     """Kind of the acoustic sentence that a line holds, and its text; None of other lines."""
     text = line.decode("ascii", "replace").strip()
-    if modem := _MODEM.search(text):
+    if "USBL" in text and (modem := _MODEM.search(text)):
         return modem[2].partition(",")[0], modem[0]
-    if (micronnav := _MICRONNAV.search(text)) is not None:
+    if "%D" in text and (micronnav := _MICRONNAV.search(text)):
         return "MicronNav", text[micronnav.start() :]
     text = text[max(text.rfind("$"), 0) :]
     if _HEX.match(text):
