@@ -26,7 +26,7 @@ from wire import (
     vision,
 )
 
-from rovgraph.live.message import GEODETIC, Message
+from rovgraph.live.message import ON_EARTH, Message
 from rovgraph.live.sources.doppler import waterlinked
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import timed_frames
@@ -37,7 +37,8 @@ from rovgraph.model.config import Config
 
 TLOG = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_small.tlog.gz"
 LONGEST_FRAME = 293  # bytes of MAVLink
-OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, "place": 1, GEODETIC: 2}  # sensor -> its first column that may be NaN
+# sensor -> its first column that may be NaN
+OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, "place": 1, "ship": 2, "usbl": 0, "range": 0} | dict.fromkeys(ON_EARTH, 2)
 
 RAPID = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -54,6 +55,12 @@ NMEA = [
     sentence("GPGGA,221320.00,5818.000,N,01506.000,E,1,08,1.5,0,M,0,M,,"),
     sentence("GPGLL,5818.000,N,01506.000,E,221320.00,A,A"),
 ]
+ACOUSTIC = [
+    sentence("PSIMSSB,221320.40,B01,A,,C,H,M,10.0,20.0,30.0,0.5,N,,"),
+    sentence("PSIMSNS,221320.40,B01,1,1,2.0,-1.0,0.0,91.0,,,0.0,,M"),
+    sentence("PSONLLD,221320.52,2401,A,58.3315406,15.1356397,99.9,3.0,4.0,0.00,0.62,,,,"),
+    b"USBLLONG,144.369001,144.132576,3,-0.0649,-3.3087,-0.9908,-3.0506,-0.5748,-1.5156,0.1,-0.0,-1.4,2303,-58,142,0.05\r\n",
+]
 ATTITUDE = mavlink.MAVLink_attitude_message(77_000, 0.1, 0.2, 0.3, 0, 0, 0)
 MAVLINK = [packed(m) for m in (raw_imu(), scaled_imu2(), highres_imu(), gps(h_acc=900), vision())]
 
@@ -62,6 +69,11 @@ DECODERS: dict[str, tuple[Callable[[Heard], Decoder], bytes, bytes]] = {
     "json": (lambda heard: json_lines("u", heard, Config()), b"\n".join(JSON * 3), b'\n{"depth": 7}\n'),
     "waterlinked": (lambda heard: waterlinked("u", heard), report() * 3, b"\n" + report(vx=7)),
     "nmea": (lambda heard: nmea("u", heard, Config()), b"".join(NMEA * 2), b"\n" + sentence("HEHDT,7.0,T")),
+    "acoustic": (
+        lambda heard: nmea("u", heard, Config()),
+        b"".join((NMEA[4:5] + ACOUSTIC) * 2),
+        b"\n" + ACOUSTIC[3],
+    ),
     "mavlink": (autopilot, b"".join(MAVLINK * 3), packed(ATTITUDE)),
 }
 
@@ -98,11 +110,11 @@ def assert_sane(messages: list[Message]) -> None:
         assert message.stamp is None or math.isfinite(message.stamp)
         assert math.isfinite(message.arrival)
         for sensor, values in message.readings:
-            assert values.shape == ((3,) if sensor == GEODETIC else (len(STREAMS[sensor]),))
+            assert values.shape == ((3,) if sensor in ON_EARTH else (len(STREAMS[sensor]),))
             if sensor == "dvl" and values[3] == 0.0:
                 continue
             assert np.isfinite(values[: OPTIONAL.get(sensor)]).all()
-            if sensor == GEODETIC:
+            if sensor in ON_EARTH:
                 assert abs(values[0]) <= 90.0
                 assert abs(values[1]) <= 360.0
 

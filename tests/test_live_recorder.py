@@ -50,8 +50,7 @@ def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
     for sensor, columns in STREAMS.items():
         for k, name in enumerate(columns):
             sent[sensor][:, k] = np.abs(sent[sensor][:, k]) if name.endswith("_sd") else sent[sensor][:, k]
-            if name in labels():
-                sent[sensor][:, k] = np.arange(20.0)
+            sent[sensor][:, k] = np.arange(20.0) if name in labels() else sent[sensor][:, k]
     sent["thruster"] = RNG.normal(size=(20, 6))
     times = EPOCH + np.cumsum(RNG.uniform(0.001, 0.1, 20))
     for k, t in enumerate(times):

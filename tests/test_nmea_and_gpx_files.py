@@ -124,7 +124,7 @@ def test_positions_relative_to_a_ship_become_fixes_at_their_own_times(axes, x, y
         + usbl(f"{12 + hours}00{max(k - 1, 0):02d}.40", axes, x, y)
         for k in range(20)
     ]
-    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path, fix="PSIMSSB B01")
     assert [channel.source for channel in recording.channels] == ["PSIMSSB B01", "GPGGA", "GPRMC"]
     assert off(recording, 30.0, -40.0) < 0.3  # of 1e-4 minutes of the ship's fixes
     close(first(recording, "fix").columns["time"][1:] % 1.0, 0.4, atol=1e-3)
@@ -135,7 +135,9 @@ def test_positions_relative_to_a_ship_become_fixes_at_their_own_times(axes, x, y
 
 def test_the_transponder_with_most_positions_is_preferred_and_others_can_be_chosen(tmp_path):
     data = under_way(usbl("1200??.00", "N", 1.0, 1.0)) + usbl("120019.00", "N", 5.0, 5.0, "B02")
-    assert first(read(data, tmp_path), "fix").source == "PSIMSSB B01"
+    assert first(read(data, tmp_path), "usbl").source == "PSIMSSB B01, PSIMSSB B02"
+    assert read(data, tmp_path).settings["usbl"]["beacon"] == "B01"
+    assert read(data, tmp_path, usbl="PSIMSSB B02").settings["usbl"]["beacon"] == "B02"
     for chosen in ("PSIMSSB B02", "GPGGA"):
         assert first(read(data, tmp_path, fix=chosen), "fix").source == chosen
     assert first(read(data, tmp_path, ahrs="HEHDT"), "ahrs").source == "HEHDT"
@@ -145,22 +147,26 @@ def test_acoustic_positions_that_cannot_be_placed_are_counted(tmp_path):
     bad = [
         usbl("120019.00", "N", 1.0, 1.0, status="V"),
         usbl("120019.00", "N", 1.0, 1.0, kind="U"),
+        usbl("120019.00", "N", 1.0, 1.0, kind="P"),
         usbl("121019.00", "N", 1.0, 1.0),  # ten minutes after the ship's last fix
     ]
-    recording = read(under_way() + b"".join(bad) + usbl("120019.00", "H", 1.0, 1.0), tmp_path)
+    recording = read(under_way() + b"".join(bad) + usbl("120019.00", "H", 1.0, 1.0), tmp_path, fix="PSIMSSB B01")
     assert first(recording, "fix").source == "PSIMSSB B01"
     assert len(first(recording, "fix").columns["time"]) == 1
     assert {each.reason for each in recording.left if each.name.startswith("PSIMSSB")} == {
         "the system marks it as not OK",
-        "not in Cartesian coordinates relative to a ship",
+        "neither in Cartesian coordinates relative to a ship nor in degrees",
+        "on a grid that is not stated, and not UTM of the ship's zone within 20 km of her",
         "the ship's position, or her heading (HDT), is not known",
     }
     without = under_way(usbl("1200??.00", "H", 1.0, 1.0), heading=b"")
     with pytest.raises(InputError, match=r"none that can be placed .*heading .*--choose fix=GPGGA"):
         read(without, tmp_path)  # the ship's own place is not the vehicle's
     assert first(read(without, tmp_path, fix="GPGGA"), "fix").source == "GPGGA"
-    with pytest.raises(InputError, match="neither fixes nor headings"):
-        read(usbl("120019.00", "N", 1.0, 1.0) * 5, tmp_path)
+    alone = usbl("120019.00", "N", 1.0, 1.0) * 5
+    with pytest.raises(InputError, match=r"ship whose fixes are not in the file.*--choose usbl=.PSIMSSB B01"):
+        read(alone, tmp_path)
+    assert [c.sensor for c in read(alone, tmp_path, usbl="PSIMSSB B01").channels] == ["usbl"]
 
 
 def ssb(clock: str, error: str = "", filtered: str = "M", x: float = 30.0, y: float = -40.0, axes: str = "N") -> bytes:
@@ -175,7 +181,7 @@ def test_an_acoustic_position_that_is_no_reply_is_none_whatever_its_status(tmp_p
         + ssb(f"1200{k:02d}.70", "", "P", 300.0, 0.0)
         for k in range(20)
     ]
-    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path, fix="PSIMSSB M17")
     assert len(first(recording, "fix").columns["time"]) == 20 and off(recording, 30.0, -40.0) < 0.8
     reasons = {each.reason: each.count for each in recording.left if each.name.startswith("PSIMSSB")}
     assert reasons == {"error NRy: not a reply": 20, "predicted, not measured": 20}
@@ -196,7 +202,7 @@ def test_the_acoustic_systems_own_heading_of_the_ship_turns_head_up_positions(tm
         gga(f"1200{k:02d}.00", 1.0 + 1.5 * k / 1853.75) + sentence(text) + ssb(f"1200{k:02d}.40", x=x, y=y, axes="H")
         for k, text in enumerate(said)
     ]
-    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path, fix="PSIMSSB M17")
     assert off(recording, 30.0, -40.0) < 0.8
 
 
@@ -206,8 +212,14 @@ def test_a_ship_at_rest_keeps_its_fixes(tmp_path):
         gga(f"12{k // 60:02d}{k % 60:02d}.00", 1.0) + sentence("HEHDT,120.0,T") + ssb(f"12{k // 60:02d}{k % 60:02d}.40")
         for k in range(300)
     ]
-    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path, fix="PSIMSSB M17")
     assert len(first(recording, "fix").columns["time"]) == 300
+    measured = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    assert [len(first(measured, sensor).columns["time"]) for sensor in ("usbl", "ship", "ship_heading")] == [
+        300,
+        300,
+        299,
+    ]
     assert len(next(c for c in recording.channels if c.source == "GPGGA").columns["time"]) == 300
 
 

@@ -40,7 +40,7 @@ from rovgraph.inference.error_state import REINITIALISE_AT_S
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.live.message import PLACED, Reading
+from rovgraph.live.message import ON_EARTH, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Event
 from rovgraph.live.warnings import Warnings
@@ -251,7 +251,7 @@ class Recorder:
         self._unsynced = False
         self._stop = threading.Event()
         names = recorded_columns()
-        columns = {**STREAMS, **PLACED, "thruster": THRUSTERS}
+        columns = {**STREAMS, **ON_EARTH, "thruster": THRUSTERS}
         self._places = {sensor: tuple(map(names.index, of_sensor)) for sensor, of_sensor in columns.items()}
         self._width = len(names)
         self._file = _opened(self.path, (",".join(names) + "\n").encode())

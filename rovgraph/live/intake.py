@@ -18,7 +18,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
-from rovgraph.live.message import GEODETIC, PLACED, SHIP_GEODETIC, Reading
+from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, precedence
 from rovgraph.model.calibration import ACOUSTICS
@@ -102,7 +102,7 @@ class Intake:
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard at that time."""
         sensor, values = reading
-        if sensor in PLACED:
+        if sensor in ON_EARTH:
             if self.origin is None:
                 self.origin = float(values[0]), float(values[1])
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)

@@ -9,9 +9,9 @@ from rovgraph.geometry import Array
 from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, THRUSTER
 from rovgraph.sensors import SENSORS
 
-GEODETIC = "geodetic"  # a fix in latitude, longitude [deg], sd [m]: becomes "fix" once there is an origin
-SHIP_GEODETIC = "ship_geodetic"  # the ship's position in the same way, which becomes "ship"
-PLACED = {GEODETIC: (*LAT_LON, "fix_sd"), SHIP_GEODETIC: (*SHIP_LAT_LON, "ship_sd")}  # and their columns
+# positions in latitude, longitude [deg] and sd [m], which become "fix" and "ship" once there is an origin
+GEODETIC, SHIP_GEODETIC = "geodetic", "ship_geodetic"
+ON_EARTH = {GEODETIC: (*LAT_LON, "fix_sd"), SHIP_GEODETIC: (*SHIP_LAT_LON, "ship_sd")}  # their columns
 
 
 class Reading(NamedTuple):
@@ -19,7 +19,7 @@ class Reading(NamedTuple):
 
     Attributes
     ----------
-    sensor : key of `SENSORS` or of `PLACED`
+    sensor : key of `SENSORS` or of `ON_EARTH`
     values : ndarray, shape (k,), SI, the stream's columns; what is optional and absent is NaN
         (``dvl_valid``: 1)
     """
@@ -68,9 +68,9 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
             values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in known.column_names])
             if known.complete is None or known.complete(values[None])[0]:
                 found.append(Reading(sensor, values))
-    for sensor, columns in PLACED.items():
-        if all(name in cells for name in columns[:2]):
-            found.append(Reading(sensor, np.array([cells.get(name, np.nan) for name in columns])))
+    for sensor, (lat, lon, sd) in ON_EARTH.items():
+        if lat in cells and lon in cells:
+            found.append(Reading(sensor, np.array([cells[lat], cells[lon], cells.get(sd, np.nan)])))
     thrusters = [f"thruster_{k + 1}" for k in range(sum(THRUSTER.fullmatch(n) is not None for n in cells))]
     if thrusters and all(name in cells for name in thrusters):
         found.append(Reading("thruster", np.array([cells[n] for n in thrusters])))

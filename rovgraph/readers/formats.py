@@ -30,6 +30,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "tlog",
     "blueos",
     "waterlinked",
+    "ugps",
     "pd0",
     "pd4",
     "pd6",

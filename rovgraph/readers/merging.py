@@ -18,6 +18,7 @@ from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.disk_columns import in_pieces, median_step
 from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, in_order, whole
+from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON
 from rovgraph.model.config import leaves
 from rovgraph.readers.clocks import BASES, JoinedClock, join_clocks
 from rovgraph.readers.lag_search import MotionSignals
@@ -26,10 +27,17 @@ from rovgraph.readers.recording import Channel, Recording
 from rovgraph.readers.selection import Selected, Unused, file_names, join_pieces, require_used, select
 from rovgraph.readers.stamps import by_arrival, put_in_order
 
-OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
+OF_INSTRUMENT = (
+    "imu",
+    "dvl",
+    "depth",
+    "fix",
+    "usbl",
+    "range",
+)  # sections of settings that belong to the channel of this sensor
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
 ARRIVAL, EVERY = "arrival", ""  # whose times are taken, and of what: a sensor, a file, or every one
-OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
+OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix", "usbl", "range")  # sensors with a calibration variable for it
 
 
 @dataclass(frozen=True)
@@ -66,10 +74,10 @@ class Merged:
 
     @property
     def first_fix(self) -> tuple[float, float] | None:
-        """Latitude and longitude [deg] of the first fix that is somewhere on Earth."""
-        for part in self.parts:
-            if "fix_lat" in part.columns and "fix_lon" in part.columns:
-                lat, lon = part.columns["fix_lat"], part.columns["fix_lon"]
+        """Latitude and longitude [deg] of the first fix that is somewhere on Earth, else of the ship at first."""
+        for names, part in ((names, part) for names in (LAT_LON, SHIP_LAT_LON) for part in self.parts):
+            if all(name in part.columns for name in names):
+                lat, lon = (part.columns[name] for name in names)
                 known = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon) & ((lat != 0.0) | (lon != 0.0)))
                 if known.size:
                     return float(lat[known[0]]), float(lon[known[0]])

@@ -23,6 +23,7 @@ from rovgraph.live.sources.mavlink import MavlinkDecoder, MavlinkOptions
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.replay import LogReplay, log_replay, refuse_other_epochs
 from rovgraph.live.sources.source import Decoder, LinkSource, Notify, Source
+from rovgraph.live.sources.ugps import RATE_HZ, UgpsPolling, ugps
 from rovgraph.live.warnings import Warnings
 from rovgraph.log.units import nearest
 from rovgraph.model.config import Config
@@ -144,6 +145,7 @@ def one_of(*known: str) -> Callable[[str], str]:
     return read
 
 
+FASTEST_HZ = 50.0  # of polling
 MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
 Known = MutableMapping[str, float]  # values that a source has found and a resumed run needs
@@ -159,6 +161,7 @@ FORMS = {
     "pd6": "pd6:/dev/ttyUSB0",
     "cerulean": "cerulean:udp://:27000",
     "nucleus": "nucleus:tcp://host:port",
+    "ugps": "ugps:http://host",
     "file": "file:log.csv",
 }
 
@@ -278,6 +281,15 @@ def _waterlinked(address: SourceUrl, notify: Notify, config: Config, pace: float
     return LinkSource(address.url, link, doppler.waterlinked(address.url, notify))
 
 
+def _ugps(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+    inner = address.inner()
+    if inner.scheme != "http":
+        raise InputError(f"{address.url}: expected {FORMS['ugps']}, such as ugps:http://192.168.2.94")
+    rate = address.take({"rate": positive}).get("rate", RATE_HZ)
+    link = UgpsPolling(*inner.host_port(default_port=80), min(rate, FASTEST_HZ), notify)
+    return LinkSource(address.url, link, ugps(address.url, notify, config))
+
+
 def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener:
     """Opener of a Doppler instrument at a TCP or UDP port, or a serial one."""
 
@@ -375,6 +387,7 @@ _OPENERS: dict[str, Opener] = {
     "pd6": _doppler(pd6, end=b"\n"),
     "cerulean": _doppler(tracker, end=b"\n"),
     "nucleus": _doppler(NucleusDecoder),
+    "ugps": _ugps,
     "file": _file,
 }
 

@@ -12,12 +12,12 @@ import pandas as pd
 from rovgraph.dates import seconds_of_texts
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.live.message import PLACED, Message, readings
+from rovgraph.live.message import ON_EARTH, Message, readings
 from rovgraph.live.sources.doppler import report_message
 from rovgraph.live.sources.source import LineDecoder, Notify
 from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
+from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
 from rovgraph.log.units import Scale, near_miss, scales, turn_angles
 from rovgraph.model.config import Config
 from rovgraph.readers.records import Refused, json_number, json_object, shown
@@ -28,8 +28,11 @@ ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
 UNKNOWN = 20  # unknown keys that are counted separately
 
 _AS_IT_IS = Scale()
-_OTHERS = {name: sensor for sensor, columns in PLACED.items() for name in columns[:2]}
-_OTHERS |= {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
+_OTHERS = {name: of for of, columns in ON_EARTH.items() for name in columns[:2]} | {
+    "dvl_valid": "dvl",
+    "dvl_sd": "dvl",
+    "place_sd": "place",
+}
 
 
 def json_lines(url: str, notify: Notify, config: Config) -> LineDecoder:
@@ -164,16 +167,17 @@ def _check(cells: dict[str, float]) -> None:
     """Raise `Refused` for values that are finite and cannot be."""
     if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
         raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
-    for name in ("dvl_sd", "fix_sd", "place_sd"):
+    for name in ("dvl_sd", "fix_sd", "ship_sd", "place_sd"):
         if cells.get(name, 1.0) <= 0.0:  # as many instruments mark a missing estimate
             del cells[name]
-    lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
-    beyond = abs(lat) > 90.0 or abs(lon) > 360.0
-    if beyond and is_placeholder(np.array([lat, lon])).any():  # of a receiver without a fix
-        cells |= dict.fromkeys(LAT_LON, 0.0)
-        lat = lon = 0.0
-    if abs(lat) > 90.0 or abs(lon) > 360.0:
-        raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
-    if all(cells.get(name) == 0.0 for name in LAT_LON):  # a receiver without a fix
-        for name in LAT_LON:
-            del cells[name]
+    for names in (LAT_LON, SHIP_LAT_LON):
+        lat, lon = (cells.get(name, 0.0) for name in names)
+        beyond = abs(lat) > 90.0 or abs(lon) > 360.0
+        if beyond and is_placeholder(np.array([lat, lon])).any():  # of a receiver without a fix
+            cells |= dict.fromkeys(names, 0.0)
+            lat = lon = 0.0
+        if abs(lat) > 90.0 or abs(lon) > 360.0:
+            raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
+        if all(cells.get(name) == 0.0 for name in names):  # a receiver without a fix
+            for name in names:
+                del cells[name]
