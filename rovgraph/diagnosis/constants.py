@@ -13,7 +13,7 @@ from rovgraph.inference.estimate import CalibrationEstimate
 from rovgraph.inference.lever_arm_bias import ARM
 from rovgraph.inference.score_test import ScoreTest, as_chain, score_test
 from rovgraph.log.units import behind, shown
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import TABLE, USBL_MOUNT
 from rovgraph.model.config import Config, beliefs
 from rovgraph.rules import RULES, START_REMEDY, remedy_of_lag
 
@@ -35,6 +35,9 @@ SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may
 TIME_OFFSETS = tuple(name for name, variable in TABLE.items() if variable.time_offset)
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
+
+
+RETURNED = 0.2  # of a stated alignment, that an estimate without it may keep
 
 
 def moved_calibration(evidence: Evidence) -> Iterator[Statistic]:
@@ -62,6 +65,23 @@ def moved_calibration(evidence: Evidence) -> Iterator[Statistic]:
             f"{abs(off[worst]):.0f} sd from its prior",
             f"check imu.mount_rpy_deg and the units of the IMU, or raise {key}",
         )
+
+
+def alignment_entered_twice(evidence: Evidence) -> Iterator[Statistic]:
+    """A mounting of the acoustic head that the replies do not have, as the system has applied it already."""
+    for c in evidence.main.calibration:
+        stated = abs(c.prior_mean)
+        if c.label in USBL_MOUNT and c.estimated and stated > 0.0 and abs(c.value) < RETURNED * stated:
+            degrees = float(np.rad2deg(c.prior_mean))
+            yield _moved(
+                evidence.start,
+                evidence.end,
+                "usbl",
+                stated / c.sd,
+                f"its replies fit a head without the {degrees:+.2g} deg of {c.label} that usbl.mount_rpy_deg states: "
+                "the system has applied its alignment already",
+                "leave it out of usbl.mount_rpy_deg",
+            )
 
 
 def _sd_of_noise(evidence: Evidence) -> dict[str, float]:

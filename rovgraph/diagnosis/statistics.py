@@ -17,6 +17,7 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     residuals.findings_of_check,
     motion.found_noise,
     constants.contradicted_constants,
+    constants.alignment_entered_twice,
     constants.moved_calibration,
     constants.earth_rate,
     motion.bias_drift,

@@ -84,6 +84,7 @@ from rovgraph.model.config_sections import (
 from rovgraph.model.gauss_markov import stationary_walk
 from rovgraph.model.presets import with_presets, without_presets
 
+ALIGNED = 1.0 / 3.0  # of a mounting's sd, where the replies are in the ship's axes or north-aligned
 SHARPEST = 1.0 / np.sqrt(600.0)  # of the prior over the density [sqrt(Hz)]
 WIDEST = 1000.0  # a fibre-optic gyro beside the bias of a MEMS gyro has 3000
 
@@ -444,6 +445,10 @@ def beliefs(config: Config) -> dict[str, Belief]:
             entry.estimate == CONSIDERED,
             np.inf if lasts is None else lasts,
         )
+    if config.usbl.frame != "transducer":  # the system has applied its alignment
+        for name in USBL_MOUNT:
+            if "sd_deg" not in getattr(config.calibration, name).model_fields_set:
+                out[name] = replace(out[name], sd=ALIGNED * out[name].sd)
     shown = ACOUSTICS if config.usbl.head == "vehicle" else ("range",)
     unused = ("range_offset",) if config.range.one_way else ("range_clock", "range_clock_drift")
     for name in (*unused, *(v for k in range(len(config.beacons), BEACONS) for v in beacon_names(k))):
