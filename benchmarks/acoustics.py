@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from fault_campaign.acoustic import Acoustic, Ship, System, ranges, usbl
+from fault_campaign.acoustic import Acoustic, Ship, System, heard_by_receivers, ranges, usbl
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import Streams, sample
 from fault_campaign.judge import Dive, Result, run_dive
@@ -188,6 +188,37 @@ def ugps(seed: int, drift: float = 1.0) -> Dive:
     return Dive(streams | {"usbl": replies} | says, config, motion, hidden)
 
 
+def four_receivers(seed: int) -> Dive:
+    """Four receivers about a boat, 1 m apart, one clock for all; a third of their ranges are missing."""
+    rng = np.random.default_rng([13, seed])
+    motion = replace(make_motion("survey of 20 minutes", rng), duration=600.0, depth=8.0)
+    middle = motion.local(np.arange(0.0, 600.0, 1.0)).mean(axis=0)
+    boat = Ship(
+        north=Profile(middle[0] + 12.0, (), ((1.0, 90.0, 0.0),)),
+        east=Profile(middle[1] - 9.0, (), ((1.0, 70.0, 1.0),)),
+        heading=Profile(0.7, (), ((0.1, 40.0, 0.2),)),
+        antenna=(0.0, 0.0, -1.0),
+        head=(0.0, 0.0, 1.0),
+        position_sd=0.3,
+    )
+    places = {str(k): (0.5 * (-1) ** (k // 2), 0.5 * (-1) ** ((k + 1) // 2), 1.0 + 0.2 * (k % 2)) for k in range(4)}
+    system = System(rate=2.4, range_sd=0.03, arm=(0.0, 0.0, -0.2), turn_around=0.0)
+    vehicle = make_vehicle("mti", AIDS)
+    heard = heard_by_receivers(motion, boat, places, system, 0.2, rng)
+    heard = heard[rng.uniform(size=len(heard)) > 0.3]
+    config = merge(configuration(vehicle), Acoustic(boat, system).ranges({}, 1.0))
+    stated = {"one_way": True, "common_sd_m": 0.2}
+    ship = {
+        "antenna_m": list(boat.antenna),
+        "sd_m": boat.position_sd,
+        "receivers": {k: list(p) for k, p in places.items()},
+    }
+    clock = {"range_clock": {"estimate": True, "sd": 0.5}}
+    config = merge(config, {"start": {"position_sd_m": 5.0}, "range": stated, "ship": ship, "calibration": clock})
+    streams, hidden = sample(motion, vehicle, rng)
+    return Dive(streams | {"range": heard} | boat.says(600.0, rng), config, motion, hidden)
+
+
 UNSTATED = Setting(round_ship=True, yaw=3.0, latency=2.0, outliers=0.1, crew=False)
 ROWS: dict[str, Callable[[int], Dive]] = {
     "USBL": lambda seed: below_ship(Setting(), seed),
@@ -200,6 +231,7 @@ ROWS: dict[str, Callable[[int], Dive]] = {
     "cluster after silence": lambda seed: below_ship(Setting(seconds=700.0, changed=cluster), seed),
     "sound speed 1 % off, 1000 m": lambda seed: below_ship(Setting(depth=1000.0, speed=1515.0), seed),
     "topside drifts 1 deg/min": ugps,
+    "four receivers, one clock": four_receivers,
     "topside does not drift": lambda seed: ugps(seed, 0.0),
 }
 

@@ -182,6 +182,19 @@ def ranges(
     return pd.concat(tables, ignore_index=True).sort_values("time", ignore_index=True)
 
 
+def heard_by_receivers(
+    motion: Motion, ship: Ship, receivers: dict[str, Triple], system: System, common_sd: float, rng: np.random.Generator
+) -> pd.DataFrame:
+    """Ranges one way to receivers on a ship, whose clock has one error at a time."""
+    t, vehicle, tables = np.arange(1.3, motion.duration - 1.0, 1.0 / system.rate), on_vehicle(motion, system.arm), []
+    clock = rng.normal(0.0, common_sd, len(t))
+    for name, arm in receivers.items():
+        one = exchange(ship.place(arm), vehicle, t, system.sound_speed, 0.0)
+        length = one.back + clock + rng.normal(0.0, system.range_sd, len(t))
+        tables.append(pd.DataFrame({"time": t + system.latency, "range": length, "range_receiver": name}))
+    return pd.concat(tables, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
+
+
 @dataclass
 class Acoustic:
     """The configuration's part that a careful crew would write of ship and system."""

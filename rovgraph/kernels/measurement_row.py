@@ -23,7 +23,7 @@ context of an acoustic measurement
 `WAIT`             2  time of the vehicle's part from the measurement's own: in asking, in answering [s]
 `STATED`           1  how late the stamp was taken to be for all this [s]
 `SINCE`            1  since the first of them, for a clock that drifts [s]
-`WAYS`             1  1 = one way, 2 = asked and answered
+`WAYS`             1  1 = one way, 2 = asked and answered, 0 = the range heard by one receiver less that by another
 `INVERTED`         1  1 = the head is on the vehicle, and the other end is what it sees
 `MOUNT_AT` ...    11  places in the calibration vector, or -1: the head's mounting (3), error of its arm (3), north and
                       east of a beacon (2), its depth, scale and offset of ranges, the clock's offset and drift, lasting

@@ -55,7 +55,8 @@ The heading, a compass's deviation and the magnetometer in full:
 
 An acoustic exchange in full, with the head on a ship; q is the transponder, T the head:
 
-    r = (|q(asked) - T(asked)| + |q(heard) - T(heard)|) / 2               two way; one way the second alone
+    r = (|q(asked) - T(asked)| + |q(heard) - T(heard)|) / 2               two way; one way the second alone,
+                                                                          of two receivers the second less the first
     u = R_hs R_sn (q - T) / |q - T|                                       direction in the head's axes
     z = (B' u) a / sin a, a the angle between u and the measured m        B: across and up, both at right angles to m
 
@@ -439,9 +440,11 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
         place = state.p[i] + there[i] + other
         ends[0, i] = place + x[WAIT] * state.v[i] - x[ASKED + i]
         ends[1, i] = place + x[WAIT + 1] * state.v[i] - x[HEARD + i]
-    share = 0.5 if x[WAYS] == 2.0 else 1.0
+    by_asked, by_heard = 0.5, 0.5
+    if x[WAYS] != 2.0:
+        by_asked, by_heard = (0.0, 1.0) if x[WAYS] == 1.0 else (-1.0, 1.0)
     asked, heard = max(math.sqrt(dot(ends[0], ends[0])), 1e-6), max(math.sqrt(dot(ends[1], ends[1])), 1e-6)
-    there_and_back = share * heard + (0.5 * asked if x[WAYS] == 2.0 else 0.0)
+    there_and_back = by_heard * heard + by_asked * asked
     scale = 1.0 + (c[int(x[SCALE_AT])] if x[SCALE_AT] >= 0.0 else 0.0)
     z_out[0] = scale * there_and_back
     for a in range(len(z_out)):
@@ -453,8 +456,8 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
                 for j in range(dim):
                     H_out[a, MOTION + int(x[at]) + j] = 0.0
     for i in range(3):
-        by[0, i] = scale * 0.5 * ends[0, i] / asked if x[WAYS] == 2.0 else 0.0
-        by[1, i] = scale * share * ends[1, i] / heard
+        by[0, i] = scale * by_asked * ends[0, i] / asked
+        by[1, i] = scale * by_heard * ends[1, i] / heard
     _by_ends(state, x, by, F, late, H_out[0], spare)
     if x[SCALE_AT] >= 0.0:
         H_out[0, MOTION + int(x[SCALE_AT])] = there_and_back

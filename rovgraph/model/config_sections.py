@@ -283,6 +283,9 @@ class RangeSettings(AcousticSettings):
 
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the transducer in body axes")
     sd_m: Positive = Field(0.5, description="noise of a range; range_sd takes precedence")
+    common_sd_m: NotNegative = Field(
+        0.3, description="error that receivers on the ship share at one time (clock); their differences are free of it"
+    )
 
 
 class Sound(ConfigSection):

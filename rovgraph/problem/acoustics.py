@@ -31,6 +31,7 @@ SHIP = "ship", "ship_heading", "ship_tilt"  # streams
 UNKNOWN_TILT_SD = math.radians(3.0)  # of a ship without ship_roll and ship_pitch, taken as level
 EDGE_SINE = math.sin(math.radians(5.0))  # nearer to its horizon no planar head measures
 DEPTH_GAP_S = 30.0  # over which the vehicle's depth is interpolated for the speed of sound
+TOGETHER_S = 0.02  # within which receivers hear one sound
 REMEMBERED_S = 600.0  # of the ship's motion, online
 Left = Counter[tuple[str, str]]
 
@@ -243,6 +244,9 @@ class Acoustics:
             if (bad & usable).any():
                 left_out[sensor, reason] += int((bad & usable).sum())
                 usable &= ~bad
+        if self._receivers and sensor == "range":
+            received = usable & np.array([other.arm_s is not None for other in others], bool)
+            usable[self._difference(stream, np.flatnonzero(received), z, sds, context)] = False
         data = np.column_stack([z, sds[:, :dim], context, names])[usable]
         time = time[usable] + late  # the assembly puts them earlier
         order = np.argsort(time, kind="stable")
@@ -435,6 +439,32 @@ class Acoustics:
             if other.beacon >= 0:
                 place, down = (LAYOUT[name].start for name in beacon_names(other.beacon))
                 context[k, at.BEACON_AT], context[k, at.DOWN_AT] = place, down
+
+    def _difference(self, stream: Stream, rows: NDArray[np.intp], z: Array, sds: Array, context: Array) -> list[int]:
+        """Of receivers that hear one sound one keeps its range, and others become differences, in place.
+
+        Their clock, and the ship's place, are one error of all of them. Pairs that share no receiver, the farthest
+        apart first, have independent noise. Those that are in a difference and have nothing to add are returned.
+        """
+        used, own = [], np.where(stream.data[:, 4] > 0.0, stream.data[:, 4], self.instruments["range"].sd[0])
+        for at_time in np.split(rows, np.flatnonzero(np.diff(stream.time[rows]) > TOGETHER_S) + 1):
+            left, pairs = at_time.tolist(), []
+            while len(left) > 1:
+                places = context[left, at.HEARD : at.HEARD + 3]
+                apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+                i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
+                pairs.append((left[i], left[j]))
+                left = [k for k in left if k not in pairs[-1]]
+            one = pairs[0][0] if pairs else left[0]
+            pairs += [(one, k) for k in left if k != one]
+            for a, b in pairs:
+                z[b, 0] -= z[a, 0]
+                sds[b, 0] = np.sqrt(own[a] ** 2 + own[b] ** 2 * (2.0 if b in left else 1.0))
+                context[b, at.ASKED : at.ASKED + 3] = context[a, at.HEARD : at.HEARD + 3]
+                context[b, [at.WAYS, at.OFFSET_AT, at.CLOCK_AT, at.DRIFT_AT, at.RANGE_AT]] = 0.0, -1, -1, -1, -1
+            used += [a for a, _ in pairs[1:] if a != one]
+            sds[one, 0] = np.hypot(sds[one, 0], self.config.range.common_sd_m)
+        return used
 
     def _noise(self, stream: Stream, length: Array, known: NDArray[np.bool_], seen: Array, ship: Array) -> Array:
         """Sds of range, across and up, shape (n, 3), with what the ship's place and attitude add to them."""
