@@ -20,7 +20,7 @@ from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
-from rovgraph.log.streams import SPACING_S, precedence
+from rovgraph.log.streams import SPACING_S, label_number, precedence
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, Mag
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -90,6 +90,7 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
+        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if b.north_m is None}
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -111,6 +112,8 @@ class Intake:
             self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
+        if sensor in ACOUSTICS and self._is_unplaced(sensor, values):
+            return None
         size = len(values)
         if size != self._sizes.setdefault(sensor, size):
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
@@ -122,6 +125,19 @@ class Intake:
             return None
         self._newest[of] = max(time, newest)
         return Measurement(time, sensor, self._with_known_sd(sensor, values), 0)
+
+    def _is_unplaced(self, sensor: str, values: Array) -> bool:
+        """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
+        named = zip(values.tolist(), self._labels(sensor), strict=False)
+        name = next((self._unplaced[value] for value, label in named if label and value in self._unplaced), None)
+        if name is None:
+            return False
+        why = f"beacon {name} has no place"
+        if not self._left_out[sensor, why]:
+            remedy = "rovgraph smooth of the recording finds it; then state north_m, east_m and sd_m under beacons"
+            self.news.append((sensor, f"{why}, and its ranges are left out: {remedy}"))
+        self._left_out[sensor, why] += 1
+        return True
 
     @staticmethod
     def _labels(sensor: str) -> tuple[bool, ...]:
