@@ -10,6 +10,7 @@ import pytest
 from dives import below_a_ship, campaign_log, same
 
 from rovgraph.dive import smooth
+from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
@@ -21,7 +22,7 @@ from rovgraph.problem.acoustics import Acoustics
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.sensors import AcousticExchange
 from rovgraph.sensors.instruments import instruments
-from rovgraph.sensors.sound import SoundSpeedProfile
+from rovgraph.sensors.sound import SoundSpeedProfile, _read, profile_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -166,6 +167,63 @@ def test_rays_and_means_are_those_of_the_closed_form_in_a_constant_gradient(angl
     assert np.arccosh(1.0 + g**2 * (across**2 + down**2) / (2.0 * c1 * c2)) / abs(g) == pytest.approx(seconds, abs=2e-8)
     (mean,) = water.mean(np.array([begin]), np.array([begin + down]))
     assert mean == pytest.approx(g * down / np.log(c2 / c1), abs=1e-3)
+
+
+def test_a_profile_is_read_from_rows_and_files_and_what_is_none_is_refused(tmp_path):
+    rows = profile_of(((0.0, 1510.0), (50.0, 1490.0)))
+    (tmp_path / "cast.csv").write_text("Depth,Sound_Speed\n0,1510\n50,1490\n")
+    read = profile_of(str(tmp_path / "cast.csv"))
+    assert rows is not None and read is not None and profile_of(None) is None
+    ends = np.array([0.0]), np.array([40.0])
+    assert rows.mean(*ends) == read.mean(*ends) == pytest.approx(1502.0, abs=0.1)
+    for bad in (((50.0, 1490.0), (0.0, 1510.0)), ((0.0, 4954.0), (50.0, 4888.0)), ((0.0, 1500.0),)):
+        with pytest.raises(InputError, match=r"sound\.profile: "):
+            profile_of(bad)
+    (tmp_path / "cast.csv").write_text("depth,c\n0,1510\n")
+    with pytest.raises(InputError, match="expected columns depth and sound_speed"):
+        _read.__wrapped__(tmp_path / "cast.csv")
+
+
+def test_a_bent_ray_is_made_straight():
+    """In a thermocline the head hears the vehicle from where it is not."""
+    water = ((0.0, 1510.0), (20.0, 1510.0), (40.0, 1480.0), (200.0, 1480.0))
+    config = parse_config("{}").changed(
+        sound={"profile": water}, ship={"north_m": 0.0, "east_m": 0.0, "heading_deg": 0}
+    )
+    profile = profile_of(water)
+    assert profile is not None
+    angle, seconds = 0.5, 0.1
+    (across,), (down,) = profile.trace(0.0, np.array([angle]), np.array([seconds]))
+    found = Acoustics(config, {"usbl": instruments(config)["usbl"]})
+    one = found.exchanges(reply(10.0, 1500.0 * seconds, 0.0, angle), 0.0, Counter()).data[0]
+    seen = one[6 + at.SEEN : 6 + at.SEEN + 3]
+    np.testing.assert_allclose(one[0] * seen, [across, 0.0, down], atol=1e-6)
+    assert abs(np.arctan2(down, across) - angle) > 0.02
+
+
+def test_receivers_that_share_a_clock_become_one_range_and_differences():
+    arms = {"0": (0.5, 0.5, 1.0), "1": (0.5, -0.5, 1.0), "2": (-0.5, -0.5, 1.0), "3": (-0.5, 0.5, 1.0)}
+    ship = {"receivers": arms, "north_m": 0.0, "east_m": 0.0, "heading_deg": 0.0}
+    config = Config().changed(range={"one_way": True, "sd_m": 0.03, "common_sd_m": 0.2}, ship=ship)
+    found = Acoustics(config, {"range": instruments(config)["range"]})
+    point, rows = np.array([12.0, 7.0, 9.0]), np.full((4, 5), np.nan)
+    for k, arm in enumerate(arms.values()):
+        rows[k, [0, 3]] = np.linalg.norm(point - arm) + 5.0, k  # a clock that is 5 m off
+    stream = Stream("range", (), np.full(4, 10.0), rows, np.arange(4))
+    made = found.exchanges(stream, 0.0, Counter())
+    x, z = made.data[:, 2 : 2 + at.WIDTH], made.data[:, 0]
+    state = State(np.eye(3)[None], point[None], np.zeros((1, 3)), np.zeros((1, 6)), _zero())
+    model = found.instruments["range"].model
+    assert isinstance(model, AcousticExchange)
+    predicted = np.array([model.of(row[None]).predict(state, np.zeros((1, 3)))[0][0, 0] for row in x])
+    ways = x[:, at.WAYS]
+    np.testing.assert_allclose(z - predicted, np.where(ways == 1.0, 5.0, 0.0), atol=1e-9)
+    assert sorted(ways) == [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(made.data[ways == 0.0, 1], 0.03 * np.sqrt(2.0))
+
+
+def _zero() -> dict[str, np.ndarray]:
+    return {name: np.zeros(variable.dim) for name, variable in TABLE.items()}
 
 
 # dives
