@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,6 +129,7 @@ class Acoustics:
         if ship.heading_deg is not None:
             self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
+        self._transponder: float | None = None  # that has answered
         self.since: float | None = None  # time of the first exchange, from which a clock drifts [s]
         self._profile = profile_of(config.sound.profile)
         if self._profile is not None:
@@ -144,31 +146,35 @@ class Acoustics:
             if sensor in streams and len(streams[sensor]):
                 self.tracks[sensor].take(streams[sensor].time, streams[sensor].data)
 
-    def insert(self, m: Measurement, late: float, left_out: Left) -> list[Measurement]:
+    def insert(self, m: Measurement, late: Mapping[str, float], left_out: Left) -> list[Measurement]:
         """Take one of the ship's measurements, or an exchange; those that are complete now.
 
         Parameters
         ----------
-        late : how late stamps of exchanges are taken to be [s]
+        late : sensor -> how late stamps of exchanges are taken to be [s]
         """
         if m.sensor in self.tracks:
             self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
             self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
         else:
             self.waiting.append(m)
-        ready, known = [], self._known_until()
-        for one in self.waiting:
-            if not self._needs_ship(one.sensor) or one.time - late <= known:
-                ready.append(one)
+        known, out = self._known_until(), []
+        ready = [one for one in self.waiting if one.time - late[one.sensor] + self._lasts(one.sensor) <= known]
         self.waiting = [one for one in self.waiting if all(one is not other for other in ready)]
-        out = []
-        for one in ready:
-            row = np.array([one.row])
-            stream = self.exchanges(Stream(one.sensor, (), np.array([one.time]), one.values[None], row), late, left_out)
-            out += [
-                Measurement(float(t), one.sensor, v, one.row) for t, v in zip(stream.time, stream.data, strict=True)
-            ]
+        for _, group in groupby(ready, lambda one: (one.sensor, one.time)):
+            some = list(group)
+            time, row = (np.array([getattr(one, name) for one in some]) for name in ("time", "row"))
+            raw = Stream(some[0].sensor, (), time, np.array([one.values for one in some]), row)
+            made = self.exchanges(raw, late[raw.sensor], left_out)
+            rows = zip(made.time.tolist(), made.data, made.row.tolist(), strict=True)
+            out += [Measurement(t, raw.sensor, values, line) for t, values, line in rows]
         return out
+
+    def _lasts(self, sensor: str) -> float:
+        """How long an exchange waits for what the ship says, and for other receivers that hear it [s]."""
+        if sensor == "range":
+            return TOGETHER_S if self._receivers else -math.inf
+        return 0.0 if self.config.usbl.head == "ship" or not self._places else -math.inf
 
     def _known_until(self) -> float:
         """Up to when all is known of the ship that it has told of so far."""
@@ -178,9 +184,6 @@ class Acoustics:
             if len(self.tracks[sensor].time) and self.tracks[sensor].held is None
         ]
         return min(ends, default=math.inf)
-
-    def _needs_ship(self, sensor: str) -> bool:
-        return self.config.usbl.head == "ship" or not self._places if sensor == "usbl" else bool(self._receivers)
 
     # measurements
 
@@ -319,6 +322,9 @@ class Acoustics:
                 f"usbl: {len(known)} transponders answer ({shown}); state which is the vehicle's: "
                 f"usbl: {{beacon: {known[0]:g}}}"
             )
+        elif len(known):
+            self._transponder = known[0] if self._transponder is None else self._transponder
+            why.append(("another transponder than the first, without usbl.beacon", label != self._transponder))
 
     def _place_ends(
         self,

@@ -193,7 +193,7 @@ class Assembly:
         reply = m.sensor in self._acoustics.instruments
         if reply and not admitted(m.sensor, m.values[None], self.config, self._left_out).all():
             return InsertResult.IN
-        late = max((self.time_offsets.of_sensor(s) for s in self._acoustics.instruments), default=0.0)
+        late = {sensor: self.time_offsets.of_sensor(sensor) for sensor in self._acoustics.instruments}
         results = [
             self._insert(one) if one.time >= settled else InsertResult.LATE
             for one in self._acoustics.insert(m, late, self._left_out)
