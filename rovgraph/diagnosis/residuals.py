@@ -38,6 +38,8 @@ SD_KEY = {
     "depth": "depth.sd_m",
     "fix": "fix.sd_m",
     "place": "place.sd_m",
+    "usbl": "usbl.angle_sd_deg",
+    "range": "range.sd_m",
     "thruster": "vehicle.acceleration_sd_mps2",
 }
 
