@@ -309,3 +309,12 @@ def test_dives_below_a_ship_are_consistent_and_a_wrong_sd_fails():
             P = track.cov_p[::10, :2, :2]
             nees[factor].append(float(np.einsum("ni,nij,nj->n", d, np.linalg.inv(P), d).mean() / 2.0))
     assert 0.3 < np.mean(nees[1.0]) < 1.6 < np.mean(nees[0.2])
+
+
+@pytest.mark.slow
+def test_isam2_ends_where_the_chain_does():
+    log, config = below_a_ship()
+    isam2 = config.changed(graph={"solver": "isam2"})
+    a, b = (smooth(log, one, "smoothed").estimates[0].trajectory for one in (config, isam2))
+    np.testing.assert_allclose(a.p_n[-1], b.p_n[-1], atol=1e-3)
+    np.testing.assert_allclose(a.cov_p[-1], b.cov_p[-1], rtol=1e-2)
