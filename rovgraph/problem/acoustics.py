@@ -317,10 +317,11 @@ class Acoustics:
                 ("another transponder than usbl.beacon", ~np.isnan(label) & (label != label_number(str(stated))))
             )
         elif len(known) > 1:
-            shown = ", ".join(f"{name:g}" for name in known[:6].tolist())
+            numbers = [f"{name:.0f}" for name in known.tolist() if name < 2**32]  # beyond are those of texts
+            shown = f" ({', '.join(numbers[:6])})" if len(numbers) == len(known) else ""
             raise InputError(
-                f"usbl: {len(known)} transponders answer ({shown}); state which is the vehicle's: "
-                f"usbl: {{beacon: {known[0]:g}}}"
+                f"usbl: {len(known)} transponders answer{shown}; state which is the vehicle's, as usbl_beacon has it: "
+                f"usbl: {{beacon: {numbers[0] if shown else 'NAME'}}}"
             )
         elif len(known):
             self._transponder = known[0] if self._transponder is None else self._transponder
