@@ -130,7 +130,7 @@ class Acoustics:
             self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
         self._transponder: float | None = None  # that has answered
-        self.since: float | None = None  # time of the first exchange, from which a clock drifts [s]
+        self.since: dict[str, float] = {}  # sensor -> time of its first exchange, from which a clock drifts [s]
         self._profile = profile_of(config.sound.profile)
         if self._profile is not None:
             self.tracks["depth"] = Track(1, False)  # of the vehicle, where ranges are made with the speed between
@@ -202,8 +202,7 @@ class Acoustics:
         """
         sensor, instrument = stream.sensor, self.instruments[stream.sensor]
         n, dim = len(stream), instrument.model.dim
-        if self.since is None and n:
-            self.since = float(stream.time[0])
+        begin = self.since.setdefault(sensor, float(stream.time[0])) if n else 0.0
         why: list[tuple[str, NDArray[np.bool_]]] = []
         seen = self._direction(stream.data) if sensor == "usbl" else np.zeros((n, 3))
         length, exact = self._length(stream)
@@ -215,7 +214,7 @@ class Acoustics:
         assert isinstance(instrument.model, AcousticExchange)
         context[:, at.ARM : at.ARM + 3] = instrument.model.arm_b
         context[:, at.SEEN : at.SEEN + 3] = seen
-        context[:, at.STATED], context[:, at.SINCE] = late, stream.time - (self.since or 0.0)
+        context[:, at.STATED], context[:, at.SINCE] = late, stream.time - begin
         context[:, at.WAYS] = 1.0 if settings.one_way else 2.0
         on_vehicle = sensor == "range" or self.config.usbl.head == "vehicle"
         if settings.stamp == "transponder":  # when the transponder heard the question, on the ship's or the vehicle's
@@ -500,21 +499,21 @@ class Acoustics:
     def copy(self) -> "Acoustics":
         """One that goes on by itself from here."""
         twin = copy(self)
+        twin.since = dict(self.since)
         twin.tracks, twin.waiting = {sensor: copy(track) for sensor, track in self.tracks.items()}, self.waiting[:]
         return twin
 
     def state(self) -> dict[str, Any]:
         """What is known of the ship, as plain values."""
         return {
-            "since": math.nan if self.since is None else self.since,
+            "since": dict(self.since),
             **{f"{sensor}_time": track.time for sensor, track in self.tracks.items()},
             **{f"{sensor}_values": track.values for sensor, track in self.tracks.items()},
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
-        since = float(state["since"])
-        self.since = None if math.isnan(since) else since
+        self.since = {str(sensor): float(time) for sensor, time in state["since"].items()}
         for sensor, track in self.tracks.items():
             track.time = np.array(state[f"{sensor}_time"], float)
             track.values = np.array(state[f"{sensor}_values"], float).reshape(-1, track.width)
