@@ -507,6 +507,7 @@ class Acoustics:
         """What is known of the ship, as plain values."""
         return {
             "since": dict(self.since),
+            "transponder": math.nan if self._transponder is None else self._transponder,
             **{f"{sensor}_time": track.time for sensor, track in self.tracks.items()},
             **{f"{sensor}_values": track.values for sensor, track in self.tracks.items()},
         }
@@ -514,6 +515,8 @@ class Acoustics:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         self.since = {str(sensor): float(time) for sensor, time in state["since"].items()}
+        known = float(state["transponder"])
+        self._transponder = None if math.isnan(known) else known
         for sensor, track in self.tracks.items():
             track.time = np.array(state[f"{sensor}_time"], float)
             track.values = np.array(state[f"{sensor}_values"], float).reshape(-1, track.width)
