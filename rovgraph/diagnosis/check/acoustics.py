@@ -1,0 +1,503 @@
+"""Acoustic positions against the DVL's track and the depth, the ship's heading against its course, unusable replies.
+
+In the plane as complex numbers, a reply puts the vehicle at ``s + w``: s is the head's place and w the way from there
+that range and direction give with the ship's heading. With D the DVL's track as in `rovgraph.diagnosis.check.fixes`,
+
+    s + m w = p + c D(t - tau).
+
+``arg m`` is the error of the head's yaw and of the ship's compass together, ``arg c`` that of the vehicle's heading; c
+is free within what is believed of that, p in each stretch. Late stamps put the ship elsewhere, too, so every lag makes
+its own s and w. Other axes are other w: a mirrored bearing is conj(w) along the ship's axes, whose ``arg m`` tells a
+wrong sense (0) from transposed x and y (90 deg); ``usbl.frame`` is tried in the same way. Another explanation is named
+where it leaves far smaller residuals.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rovgraph.diagnosis.check.findings import Finding, believed_lag, since
+from rovgraph.diagnosis.check.fixes import (
+    ENOUGH_DISTANCE,
+    MIN_FIXES,
+    Complexes,
+    Tracks,
+    heading_believed,
+    inflation,
+    tracks,
+)
+from rovgraph.diagnosis.check.inertial import in_gap
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, wrap_angle
+from rovgraph.log import Log, Stream
+from rovgraph.model.config import Config, beliefs
+from rovgraph.problem.acoustics import Sightings, sightings, unusable_acoustics
+from rovgraph.rules import ACOUSTIC_TRACK, BELIEVED_SDS, SURE, USUAL_SHARE, remedy_of_lag
+from rovgraph.sensors.acoustic import in_degrees
+from rovgraph.sensors.instruments import heading_sources, instruments
+from rovgraph.sensors.sensor import SENSORS
+
+FRAMES = "transducer", "ship", "north"
+MOST = 1500  # replies that are compared, evenly
+PASSES = 5  # of reweighting
+TUKEY = 3.0  # sds at which a reply begins to count less
+LAG_STEP_S, COARSE_S = 0.2, 0.6
+BETTER = 1.5  # times the variance, that another explanation leaves less of,
+EVIDENCE = 40.0  # and in chi-square
+AXIS = np.deg2rad(15.0)  # around a multiple of 90 deg, within which it is named
+TWICE = np.deg2rad(2.0)  # from which on an alignment that is applied twice is named
+TELLING = np.deg2rad(5.0)  # sd of the yaw, up to which it is reported
+OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
+DEPTH_OFF_M = 1.0
+GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
+COARSE_M = 0.1  # resolution of depths that such systems pass on
+NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
+COURSE_S, UNDER_WAY_MPS = 10.0, 1.0  # over which a course is taken, and the speed from which on it is one
+ENOUGH_COURSES = 6
+CONCENTRATED, TURNS = 0.9, 0.9  # mean of unit vectors of angles that are one, and of courses that are not
+OFF_COURSE = np.deg2rad(30.0)  # of a ship's heading, that neither current nor wind makes on several courses
+
+
+def usable(log: Log, config: Config, frame: str | None = None, late: float | None = None) -> Sightings | None:
+    """Positions by the replies that are sound, at most `MOST`; None where there are too few.
+
+    Parameters
+    ----------
+    frame : other than `usbl.frame`
+    late : how late the stamps are [s]; None = as it is believed
+    """
+    if "usbl" not in log or "usbl" in unusable_acoustics(config, log.sensors) or _wrong_unit(log):
+        return None
+    if frame is not None and frame != config.usbl.frame:
+        config = config.model_copy(update={"usbl": config.usbl.model_copy(update={"frame": frame})})
+    replies = _sound(log, config)
+    if len(replies) > MOST:
+        replies = replies.take(np.unique(np.linspace(0, len(replies) - 1, MOST).astype(int)))
+    late = believed_lag(config, "usbl")[0] if late is None else late
+    try:
+        seen = sightings(_with(log, replies), config, instruments(config), late)
+    except InputError:  # `replies` reports it
+        return None
+    return seen if seen is not None and len(seen.positions) >= MIN_FIXES else None
+
+
+def _wrong_unit(log: Log) -> bool:
+    """Whether directions or the ship's headings are in degrees, which their sensors report themselves."""
+    return any(
+        sensor in log and in_degrees(log[sensor].data[:, columns]).any()
+        for sensor, columns in (("usbl", slice(2, 4)), ("ship_heading", slice(0, 1)))
+    )
+
+
+def _sound(log: Log, config: Config) -> Stream:
+    """Replies that can be true."""
+    stream = log["usbl"]
+    bad = [mask for _, mask in SENSORS["usbl"].refused(stream.data, config)]
+    return stream.take(~np.any(bad, axis=0))
+
+
+def _with(log: Log, stream: Stream) -> Log:
+    return replace(log, streams={**log.streams, stream.sensor: stream})
+
+
+def replies(log: Log, config: Config) -> Iterator[Finding]:
+    """Replies and ranges that cannot be used, by the ship's log, the beacons and the values themselves."""
+    for sensor, why in unusable_acoustics(config, log.sensors).items():
+        yield Finding(sensor, "warning", f"it is left out: {why}", "missing")
+    if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors):
+        stream = log["usbl"]
+        refused = {why: int(mask.sum()) for why, mask in SENSORS["usbl"].refused(stream.data, config)}
+        sound = _sound(log, config)
+        try:
+            seen = sightings(_with(log, sound), config, instruments(config)) if len(sound) else None
+        except InputError as error:
+            yield Finding("usbl", "error", str(error).removeprefix("usbl: "), "missing")
+            return
+        unused = refused | ({} if seen is None else seen.unused)
+        for why, count in unused.items():
+            if count:
+                yield _unused(log, config, why, count, len(stream))
+
+
+def _unused(log: Log, config: Config, why: str, count: int, of: int) -> Finding:
+    """Replies that are left out, and what would mend it."""
+    text, tail = f"{count} of {of} replies ({count / of:.1%}) are left out: {why}", ""
+    if why.endswith("of the ship"):
+        sensor = "ship" if "position" in why else "ship_heading"
+        tail = f"; {_extent(log, sensor)}, and is interpolated over up to ship.max_gap_s = {config.ship.max_gap_s:g} s"
+    elif "usbl.beacon" in why:
+        names = np.unique(log["usbl"]["usbl_beacon"])
+        shown = ", ".join(f"{name:g}" for name in names[~np.isnan(names)][:6].tolist())
+        tail = f"; usbl.beacon is {config.usbl.beacon}, the log has {shown}"
+        if count < of:
+            return Finding("usbl", "ok", text + tail)
+    return Finding("usbl", "warning" if count > USUAL_SHARE * of else "ok", text + tail, "missing")
+
+
+def _extent(log: Log, sensor: str) -> str:
+    """From when to when the ship is known, and its longest silence."""
+    if sensor not in log:
+        return f"{sensor} is not in the log"
+    time = log[sensor].time
+    text = f"{sensor} begins at {since(log, time[0])}, ends at {since(log, time[-1])}"
+    k = int(np.argmax(np.diff(time))) if len(time) > 1 else -1
+    return text + (f", is silent for {time[k + 1] - time[k]:.1f} s from {since(log, time[k])} on" if k >= 0 else "")
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Least squares of acoustic positions by the DVL's track.
+
+    Attributes
+    ----------
+    m : factor of the way from the head, complex
+    sd : of m, relative
+    variance : of what is left in both components together, by the median [m2]
+    left : ndarray of complex, shape (k,), what is left [m]
+    spread : of the DVL's track at these times [m]
+    """
+
+    m: complex
+    sd: float
+    variance: float
+    left: Complexes
+    spread: float
+
+    @property
+    def turn(self) -> float:
+        """How far the head's directions have to be turned [rad]."""
+        return float(np.angle(self.m))
+
+    def cost(self, variance: float) -> float:
+        """Robust chi-square of what is left."""
+        return float(TUKEY**2 * np.sum(np.log1p(np.abs(self.left) ** 2 / (TUKEY**2 * variance))))
+
+    def better(self, other: "_Fit") -> bool:
+        """Whether it leaves far less than another, beyond chance."""
+        ratio = other.variance / self.variance
+        return ratio > BETTER and 2.0 * len(self.left) / inflation(self.left) * math.log(ratio) > EVIDENCE
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """Acoustic positions beside the DVL's track, by several explanations.
+
+    Attributes
+    ----------
+    log, config : replies and beliefs
+    track : of the DVL
+    heading_sd : of the vehicle's heading, as believed [rad]
+    """
+
+    log: Log
+    config: Config
+    track: Tracks
+    heading_sd: float
+
+    @classmethod
+    def of(cls, log: Log, config: Config) -> "_Beside | None":
+        """None where something is missing."""
+        seen = usable(log, config)
+        if seen is None:
+            return None
+        arm = config.fix.model_copy(update={"lever_arm_m": config.usbl.beacon_arm_m})
+        positions = replace(seen.positions, sensor="fix")
+        track = tracks(_with(log, positions), config.model_copy(update={"fix": arm}))
+        if track is None or track.plane.count < MIN_FIXES:
+            return None
+        sources = {track.sensor, *heading_sources(config, log.sensors)}
+        return cls(log, config, track, heading_believed(config, sources) / BELIEVED_SDS)
+
+    def fit(self, late: float, frame: str | None = None, mirrored: bool = False) -> _Fit | None:
+        """Fit with stamps that are late, other axes, and bearings of the other sense; None with too few replies."""
+        log = _with(self.log, _signed(self.log["usbl"], bearing=-1.0)) if mirrored else self.log
+        seen = usable(log, self.config, frame, late)
+        if seen is None:
+            return None
+        plane = self.track.beside(seen.positions)
+        if plane.count < MIN_FIXES:
+            return None
+        away = seen.positions.data[:, :2] - seen.head[:, :2]
+        w, D = plane.free(away[:, 0] + 1j * away[:, 1]), plane.free(plane.at(self.track.way, 0.0))
+        y = plane.free(plane.fixes) - D
+        A, weight, x = np.column_stack([-w, D]), np.ones(len(y)), np.zeros(2, complex)
+        prior = np.array([1e-6, 0.5 / max(self.heading_sd, 1e-3) ** 2])
+        for _ in range(PASSES):
+            left = y - A @ x
+            variance = max(float(np.median(np.abs(left) ** 2)) / math.log(2.0), 1e-6)
+            weight = 1.0 / (1.0 + np.abs(left) ** 2 / (TUKEY**2 * variance))
+            N = (A.conj().T * weight) @ A / variance + np.diag(prior)
+            x = np.linalg.solve(N, (A.conj().T * weight) @ y / variance)
+        left = y - A @ x
+        variance = max(float(np.median(np.abs(left) ** 2)) / math.log(2.0), 1e-6)
+        m = 1.0 + complex(x[0])
+        sd = math.sqrt(0.5 * float(np.linalg.inv(N)[0, 0].real) * inflation(left)) / max(abs(m), 1e-3)
+        spread = float(2.0 * np.sqrt(np.mean(np.abs(D) ** 2)))
+        return _Fit(m, sd, variance, left, spread)
+
+    def lag(
+        self, frame: str | None = None, mirrored: bool = False, step: float = LAG_STEP_S
+    ) -> tuple[float, float, float, _Fit] | None:
+        """How late the stamps are beyond what is believed [s], its sd, what it explains in chi-square, and the fit."""
+        believed, reach = believed_lag(self.config, "usbl")[0], ACOUSTIC_TRACK.reach_s
+        lags = np.arange(-round(1.0 / step), round(reach / step) + 1) * step
+        fits = [self.fit(believed + float(lag), frame, mirrored) for lag in lags]
+        known = [(lag, fit) for lag, fit in zip(lags.tolist(), fits, strict=True) if fit is not None]
+        if len(known) < len(lags):
+            return None
+        best = min(fit.variance for _, fit in known)
+        cost = np.array([fit.cost(best) / len(fit.left) for _, fit in known]) * len(known[0][1].left)
+        k = int(np.argmin(cost))
+        count, zero = inflation(known[k][1].left), int(np.argmin(np.abs(lags)))
+        if not 0 < k < len(lags) - 1:
+            return float(lags[k]), np.inf, 0.0, known[k][1]
+        bend = float(cost[k - 1] - 2.0 * cost[k] + cost[k + 1]) / step**2 / count
+        seconds = lags[k] + 0.5 * (cost[k - 1] - cost[k + 1]) / step / max(bend * count, 1e-12)
+        sd = math.sqrt(2.0 / max(bend, 1e-12))
+        return float(seconds), sd, float(cost[zero] - cost[k]) / count, known[k][1]
+
+
+def _signed(stream: Stream, bearing: float = 1.0, elevation: float = 1.0) -> Stream:
+    """Replies with bearings or elevations of the other sign."""
+    return replace(stream, data=stream.data * np.array([1, 1, bearing, elevation, 1, bearing, elevation, 1, 1, 1]))
+
+
+def positions(log: Log, config: Config) -> Iterator[Finding]:
+    """Axes, frame, turn and clock of acoustic positions against the DVL's track."""
+    upside_down = _elevations_reversed(log, config)
+    beside = _Beside.of(_with(log, _signed(log["usbl"], elevation=-1.0)) if upside_down else log, config)
+    found = None if beside is None else beside.lag()
+    if beside is None or found is None:
+        return
+    seconds, sd, evidence, late = found
+    if late.spread < max(ENOUGH_DISTANCE, SURE * math.sqrt(late.variance)):
+        yield Finding("usbl", "ok", "too little movement to compare acoustic positions with the DVL's track")
+        return
+    if other := _other_axes(beside, late):
+        yield Finding("usbl", "warning", *other)
+        return
+    is_late = evidence > ACOUSTIC_TRACK.evidence and ACOUSTIC_TRACK.is_late(seconds, sd, (0.0, _lag_sd(config)))
+    fit = late if is_late else beside.fit(believed_lag(config, "usbl")[0])
+    if fit is not None:
+        yield from _turned(config, fit)
+    if is_late:
+        total = believed_lag(config, "usbl")[0] + seconds
+        text = (
+            f"acoustic positions come {abs(total):.1f} s {'late' if total > 0.0 else 'early'} beside the DVL's track "
+        )
+        text += f"and the ship's (sd {sd:.2f} s): {remedy_of_lag(config, 'usbl', total, sd)}"
+        yield Finding("usbl", "warning", text, "lag")
+
+
+def _lag_sd(config: Config) -> float:
+    return believed_lag(config, "usbl")[1]
+
+
+def _other_axes(beside: _Beside, as_is: _Fit) -> tuple[str, str] | None:
+    """Text and kind of other axes that explain the replies far better, by whichever needs the smallest turn."""
+    config, own = beside.config, beside.config.usbl.frame
+    tried: list[tuple[str, bool, _Fit]] = []
+    for frame in FRAMES:
+        for mirrored in (False, True):
+            if (frame, mirrored) == (own, False):
+                continue
+            found = beside.lag(frame, mirrored, COARSE_S)
+            if found is not None:
+                tried.append((frame, mirrored, found[3]))
+    good = [one for one in tried if one[2].better(as_is)]
+    if not good:
+        return None
+    least = min(fit.variance for *_, fit in good)
+    close = [one for one in good if one[2].variance < BETTER * least]
+    frame, mirrored, fit = min(close, key=lambda one: (one[1], abs(one[2].turn) > AXIS, one[0] != own, one[2].variance))
+    residuals = f"{math.sqrt(fit.variance):.1f} m is left instead of {math.sqrt(as_is.variance):.1f} m"
+    if mirrored:
+        return _mirrored(beside.log, config, fit, frame, residuals), "axes"
+    turned = "" if abs(fit.turn) < AXIS else f" and {_yaw(config, fit.turn)}"
+    text = (
+        f"its directions fit the DVL's track in axes of the frame {frame}: {residuals}; state usbl: {{frame: {frame}}}"
+    )
+    return text + turned, "axes"
+
+
+def _mirrored(log: Log, config: Config, fit: _Fit, frame: str, residuals: str) -> str:
+    """What mends bearings of the other sense: turned by 90 degrees, they are transposed coordinates."""
+    quarter = round(fit.turn / (0.5 * np.pi)) % 4
+    exact = abs(wrap_angle(np.array([fit.turn - quarter * 0.5 * np.pi]))[0]) < AXIS
+    by_place = bool(np.isnan(log["usbl"]["usbl_bearing"]).all())
+    also = "" if frame == config.usbl.frame else f", and usbl: {{frame: {frame}}}"
+    if exact and quarter == 1:
+        what = "x and y are transposed"
+    elif exact and quarter == 0:
+        what = "y points to port" if by_place else "bearings count anticlockwise"
+    elif exact and quarter == 2:
+        what = "x points astern" if by_place else "bearings count anticlockwise from astern"
+    else:
+        what = f"its axes are mirrored and turned by {np.rad2deg(fit.turn):+.0f} deg"
+    if by_place and exact and quarter in (0, 2):
+        remedy = f"state units: {{{_negated(config, ('usbl_y', 'usbl_x')[quarter // 2])}}}"
+    elif by_place and exact and quarter == 1:
+        named = config.columns
+        x, y = named.get("usbl_x", "usbl_x"), named.get("usbl_y", "usbl_y")
+        remedy = f"state columns: {{usbl_x: {y}, usbl_y: {x}}}"
+    else:
+        remedy = f"state units: {{{_negated(config, 'usbl_y' if by_place else 'usbl_bearing')}}}"
+        remedy += "" if exact and quarter == 0 else f" and {_yaw(config, fit.turn)}"
+    return f"{what}: corrected, {residuals} beside the DVL's track; {remedy}{also}"
+
+
+def _negated(config: Config, column: str) -> str:
+    """Entry of ``units`` that turns the sign of a column."""
+    group, plain = ("usbl_direction", "rad") if column in ("usbl_bearing", "usbl_elevation") else ("usbl", "m")
+    unit = config.units.get(column, config.units.get(group, plain))
+    return f"{column}: {unit.removeprefix('-') if unit.startswith('-') else f'-{unit}'}"
+
+
+def _yaw(config: Config, turn: float) -> str:
+    """Entry of the head's mounting that turns its directions."""
+    roll, pitch, yaw = config.usbl.mount_rpy_deg
+    new = math.degrees(float(wrap_angle(np.array([math.radians(yaw) + turn]))[0]))
+    return f"usbl.mount_rpy_deg: [{roll:g}, {pitch:g}, {new:.0f}]"
+
+
+def _turned(config: Config, fit: _Fit) -> Iterator[Finding]:
+    """How far the head's yaw and the ship's compass together are off."""
+    degrees, prior = np.rad2deg(fit.turn), beliefs(config)["usbl_yaw"]
+    believed = BELIEVED_SDS * prior.sd if prior.estimate else 0.0
+    stated = math.radians(config.usbl.mount_rpy_deg[2])
+    off = float(prior.mean[0]) - stated  # what is believed beside the nominal mounting
+    text = f"acoustic positions fit the DVL's track when its directions are turned by {degrees:+.1f} deg"
+    text += f" (sd {np.rad2deg(fit.sd):.1f} deg)"
+    twice = abs(fit.turn) > max(TWICE, SURE * fit.sd) and abs(fit.turn + stated) < max(0.5 * TWICE, 3.0 * fit.sd)
+    if twice and abs(stated) > TWICE:
+        yield Finding(
+            "usbl", "warning", f"{text}: usbl.mount_rpy_deg is applied twice; state {_yaw(config, fit.turn)}", "turned"
+        )
+    elif abs(fit.turn - off) > believed + SURE * fit.sd:
+        text += (
+            f": the head's yaw or the ship's heading is off; state {_yaw(config, fit.turn)}, or correct ship_heading"
+        )
+        yield Finding("usbl", "warning", text, "turned")
+    elif fit.sd < TELLING:
+        yield Finding("usbl", "ok", text)
+
+
+def _depth_errors(log: Log, config: Config, frame: str | None = None) -> tuple[Array, Array, Sightings] | None:
+    """Depths by range and direction less the depth sensor's, shape (k,), level distances [m], and the positions."""
+    if "depth" not in log or len(log["depth"]) < 2 or (seen := usable(log, config, frame)) is None:
+        return None
+    time, depth = seen.positions.time, log["depth"]
+    inside = ~in_gap(time, depth.time, 5.0)
+    arm = config.usbl.beacon_arm_m[2] - config.depth.lever_arm_m[2]
+    errors = seen.positions.data[:, 2] - np.interp(time, depth.time, depth["depth"]) - arm
+    away = np.hypot(*(seen.positions.data[:, :2] - seen.head[:, :2]).T)
+    return (errors[inside], away[inside], seen) if inside.sum() >= MIN_FIXES else None
+
+
+def _elevations_reversed(log: Log, config: Config) -> bool:
+    """Whether depths by range and direction are far nearer to the depth sensor's with elevations of the other sign."""
+    if "usbl" not in log:
+        return False
+    reversed_log = _with(log, _signed(log["usbl"], elevation=-1.0))
+    found = [_depth_errors(each, config) for each in (log, reversed_log)]
+    as_is, other = (np.inf if one is None else float(np.median(np.abs(one[0]))) for one in found)
+    return bool(np.isfinite(as_is) and OPPOSITE * max(other, DEPTH_OFF_M / OPPOSITE) < as_is)
+
+
+def depths(log: Log, config: Config) -> Iterator[Finding]:
+    """Depths by range and elevation against the depth sensor: sign, offset, and whether they are its own."""
+    found = _depth_errors(log, config)
+    if found is None:
+        return
+    errors, away, seen = found
+    if _elevations_reversed(log, config):
+        by_place = bool(np.isnan(log["usbl"]["usbl_elevation"]).all())
+        column = "usbl_z" if by_place else "usbl_elevation"
+        text = f"depths by range and direction are {np.median(errors):+.1f} m off the depth sensor's: {column} counts "
+        yield Finding("usbl", "warning", f"{text}upwards; state units: {{{_negated(config, column)}}}", "sign")
+        return
+    off = float(np.median(errors))
+    noise = 1.4826 * float(np.median(np.abs(errors - off)))
+    text = f"depths by range and direction are {off:+.2f} m off the depth sensor's (noise {noise:.2f} m)"
+    length = float(np.median(np.hypot(away, errors + seen.positions.data[0, 2])))
+    priors = beliefs(config)
+    parts = (
+        *(priors[name].sd * float(np.median(away)) for name in ("usbl_roll", "usbl_pitch")),
+        priors["sound_speed_scale"].sd * length,
+        priors["usbl_arm"].sd,
+    )
+    sd = 1.2533 * noise * math.sqrt(inflation(errors - off + 0j) / len(errors))
+    if abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
+        x, y, z = config.usbl.lever_arm_m
+        text += f": check the head's depth below the waterline, usbl.lever_arm_m: [{x:g}, {y:g}, {z - off:.1f}] would "
+        yield Finding("usbl", "warning", f"{text}mend it, and the elevation and the sound speed", "zero")
+    elif config.usbl.depth == "measured" and _is_given(log, config, seen):
+        text += ", nearer than directions measure: they are that sensor's own; state usbl: {depth: given}"
+        yield Finding("usbl", "warning", text, "repeats")
+    else:
+        yield Finding("usbl", "ok", text)
+
+
+def _is_given(log: Log, config: Config, seen: Sightings) -> bool:
+    """Whether level depths agree with the depth sensor far better than the noise of bearings lets elevations do."""
+    found = _depth_errors(log, config, "north" if config.usbl.frame == "north" else "ship")
+    if found is None:
+        return False
+    level = found[0]
+    noise = 1.4826 * float(np.median(np.abs(level - np.median(level))))
+    w = seen.positions.data[:, :3] - seen.head
+    away, length = np.hypot(w[:, 0], w[:, 1]), np.linalg.norm(w, axis=1)
+    telling = away > NEAR_AXIS * length
+    if telling.sum() < MIN_FIXES:
+        return False
+    bearing = np.unwrap(np.arctan2(w[telling, 1], w[telling, 0]))
+    second = np.abs(np.diff(bearing, 2)) / math.sqrt(6.0) / 0.6745
+    across = float(np.median(second * (away / length)[telling][1:-1]))
+    expected = across * float(np.median(away))
+    return expected > max(config.depth.sd_m, COARSE_M) / GIVEN and noise < GIVEN * expected
+
+
+def ship(log: Log, config: Config) -> Iterator[Finding]:
+    """The ship's heading against its course over ground."""
+    if not {"ship", "ship_heading"} <= log.sensors or _wrong_unit(log):
+        return
+    course, heading = _courses(log["ship"], log["ship_heading"])
+    if len(course) < ENOUGH_COURSES:
+        return
+    along, against = (complex(np.mean(np.exp(1j * (heading - sense * course)))) for sense in (1.0, -1.0))
+    several = abs(np.mean(np.exp(1j * course))) < TURNS
+    if abs(along) > CONCENTRATED:
+        off = float(np.angle(along))
+        text = f"it points {np.rad2deg(off):+.0f} deg off the ship's course, from {UNDER_WAY_MPS:g} m/s on"
+        if several and abs(off) > OFF_COURSE:
+            remedy = f"correct it, or state {_yaw(config, -off)}"
+            yield Finding("ship_heading", "warning", f"{text}, on several courses; {remedy}", "turned")
+        else:
+            yield Finding("ship_heading", "ok", text)
+    elif several and abs(against) > CONCENTRATED:
+        zero = round(float(np.angle(against)) / (0.5 * np.pi)) % 4
+        remedy = {0: "nwu", 1: "enu"}.get(zero)
+        text = "it turns opposite to the ship's course: it counts anticlockwise"
+        text += (
+            f"; state angles: {{ship_heading: {remedy}}}" if remedy else ", from another direction than north or east"
+        )
+        yield Finding("ship_heading", "warning", text, "sign")
+
+
+def _courses(ship: Stream, heading: Stream) -> tuple[Array, Array]:
+    """Courses over ground between means of some seconds, and the mean headings there, shape (k,) [rad]."""
+    edges = np.arange(ship.time[0], ship.time[-1], COURSE_S)
+    block = np.searchsorted(edges, ship.time, side="right") - 1
+    n = np.maximum(np.bincount(block, minlength=len(edges)), 1)
+    place = [np.bincount(block, ship.data[:, k], minlength=len(edges)) / n for k in (0, 1)]
+    when = np.bincount(block, ship.time, minlength=len(edges)) / n
+    told = np.bincount(block, minlength=len(edges)) > 0
+    p, t = (place[0] + 1j * place[1])[told], when[told]
+    v = np.diff(p) / np.maximum(np.diff(t), 1e-9)
+    turn = np.concatenate([[0.0], np.cumsum(np.exp(1j * heading.data[:, 0]))])
+    first, last = np.searchsorted(heading.time, t[:-1]), np.searchsorted(heading.time, t[1:])
+    mean = turn[last] - turn[first]
+    under_way = (np.abs(v) > UNDER_WAY_MPS) & (np.diff(t) < 2.0 * COURSE_S) & (last > first)
+    return np.angle(v[under_way]), np.angle(mean[under_way])
