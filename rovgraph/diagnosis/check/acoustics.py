@@ -1,15 +1,15 @@
 """Acoustic positions against the DVL's track and the depth, the ship's heading against its course, unusable replies.
 
-In the plane as complex numbers, a reply puts the vehicle at ``s + w``: s is the head's place and w the way from there
-that range and direction give with the ship's heading. With D the DVL's track as in `rovgraph.diagnosis.check.fixes`,
+In the plane as complex numbers, range and direction give with the ship's heading the way w from the head, at s, to the
+vehicle. With D the DVL's track as in `rovgraph.diagnosis.check.fixes`,
 
-    s + m w = p + c D(t - tau).
+    w = n (p + c D(t - tau) - s) = n p + g D(t - tau) - n s.
 
-``arg m`` is the error of the head's yaw and of the ship's compass together, ``arg c`` that of the vehicle's heading; c
-is free within what is believed of that, p in each stretch. Late stamps put the ship elsewhere, too, so every lag makes
-its own s and w. Other axes are other w: a mirrored bearing is conj(w) along the ship's axes, whose ``arg m`` tells a
-wrong sense (0) from transposed x and y (90 deg); ``usbl.frame`` is tried in the same way. Another explanation is named
-where it leaves far smaller residuals.
+``-arg n`` is the error of the head's yaw and of the ship's compass together, ``arg c`` that of the vehicle's heading: g
+and n differ by no more than is believed of that; p is free in each stretch. Late stamps put the ship elsewhere, too, so
+every lag makes its own s and w. Other axes are other w: a mirrored bearing is conj(w) along the ship's axes, whose turn
+tells a wrong sense (0) from transposed x and y (90 deg); ``usbl.frame`` is tried in the same way. Another explanation
+is named where it leaves far smaller residuals.
 """
 
 import math
@@ -22,6 +22,7 @@ from rovgraph.diagnosis.check.findings import Finding, believed_lag, since
 from rovgraph.diagnosis.check.fixes import (
     ENOUGH_DISTANCE,
     MIN_FIXES,
+    UNEXPLAINED,
     Complexes,
     Tracks,
     heading_believed,
@@ -40,10 +41,10 @@ from rovgraph.sensors.instruments import heading_sources, instruments
 from rovgraph.sensors.sensor import SENSORS
 
 FRAMES = "transducer", "ship", "north"
-MOST = 1500  # replies that are compared, evenly
-PASSES = 5  # of reweighting
+MOST = 600  # replies that are compared, evenly
+PASSES, TURNINGS = 5, 3  # of reweighting, of turning the head's axes as a fit has them
 TUKEY = 3.0  # sds at which a reply begins to count less
-LAG_STEP_S, COARSE_S = 0.2, 0.6
+EARLIEST_S, STEP_S, FINE_S = -1.0, 0.6, 0.15  # lags that are tried
 BETTER = 1.5  # times the variance, that another explanation leaves less of,
 EVIDENCE = 40.0  # and in chi-square
 AXIS = np.deg2rad(15.0)  # around a multiple of 90 deg, within which it is named
@@ -106,7 +107,7 @@ def replies(log: Log, config: Config) -> Iterator[Finding]:
     """Replies and ranges that cannot be used, by the ship's log, the beacons and the values themselves."""
     for sensor, why in unusable_acoustics(config, log.sensors).items():
         yield Finding(sensor, "warning", f"it is left out: {why}", "missing")
-    if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors):
+    if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors) and not _wrong_unit(log):
         stream = log["usbl"]
         refused = {why: int(mask.sum()) for why, mask in SENSORS["usbl"].refused(stream.data, config)}
         sound = _sound(log, config)
@@ -152,32 +153,37 @@ class _Fit:
 
     Attributes
     ----------
-    m : factor of the way from the head, complex
-    sd : of m, relative
+    turn : of the head's directions, and its sd [rad]
     variance : of what is left in both components together, by the median [m2]
     left : ndarray of complex, shape (k,), what is left [m]
     spread : of the DVL's track at these times [m]
     """
 
-    m: complex
+    turn: float
     sd: float
     variance: float
     left: Complexes
     spread: float
 
-    @property
-    def turn(self) -> float:
-        """How far the head's directions have to be turned [rad]."""
-        return float(np.angle(self.m))
-
     def cost(self, variance: float) -> float:
         """Robust chi-square of what is left."""
         return float(TUKEY**2 * np.sum(np.log1p(np.abs(self.left) ** 2 / (TUKEY**2 * variance))))
+
+    @property
+    def explained(self) -> bool:
+        """Whether what is left is about the noise that differences of neighbours show."""
+        noise = _variance(np.abs(self.left[2:] - 2.0 * self.left[1:-1] + self.left[:-2]) ** 2 / 6.0)
+        return self.variance < UNEXPLAINED * noise
 
     def better(self, other: "_Fit") -> bool:
         """Whether it leaves far less than another, beyond chance."""
         ratio = other.variance / self.variance
         return ratio > BETTER and 2.0 * len(self.left) / inflation(self.left) * math.log(ratio) > EVIDENCE
+
+
+def _variance(square: Array) -> float:
+    """Of both components together, of squared residuals, by their median."""
+    return max(float(np.median(square)) / math.log(2.0), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -210,53 +216,88 @@ class _Beside:
         sources = {track.sensor, *heading_sources(config, log.sensors)}
         return cls(log, config, track, heading_believed(config, sources) / BELIEVED_SDS)
 
-    def fit(self, late: float, frame: str | None = None, mirrored: bool = False) -> _Fit | None:
-        """Fit with stamps that are late, other axes, and bearings of the other sense; None with too few replies."""
-        log = _with(self.log, _signed(self.log["usbl"], bearing=-1.0)) if mirrored else self.log
-        seen = usable(log, self.config, frame, late)
+    def fit(self, late: float, axes: "_Axes") -> _Fit | None:
+        """Fit with stamps that are late, in some axes; None with too few replies."""
+        usbl = self.config.usbl
+        roll, pitch, yaw = usbl.mount_rpy_deg
+        mount = roll, pitch, yaw + math.degrees(axes.yaw)
+        config = self.config.model_copy(update={"usbl": usbl.model_copy(update={"mount_rpy_deg": mount})})
+        log = _with(self.log, _signed(self.log["usbl"], bearing=-1.0)) if axes.mirrored else self.log
+        seen = usable(log, config, axes.frame, late)
         if seen is None:
             return None
         plane = self.track.beside(seen.positions)
         if plane.count < MIN_FIXES:
             return None
         away = seen.positions.data[:, :2] - seen.head[:, :2]
-        w, D = plane.free(away[:, 0] + 1j * away[:, 1]), plane.free(plane.at(self.track.way, 0.0))
-        y = plane.free(plane.fixes) - D
-        A, weight, x = np.column_stack([-w, D]), np.ones(len(y)), np.zeros(2, complex)
-        prior = np.array([1e-6, 0.5 / max(self.heading_sd, 1e-3) ** 2])
+        way = away[:, 0] + 1j * away[:, 1]
+        w, s, D = (plane.free(each) for each in (way, plane.fixes - way, plane.at(self.track.way, 0.0)))
+        A, x = np.column_stack([-s, D]), np.zeros(2, complex)
+        prior = np.array([[1.0, -1.0], [-1.0, 1.0]]) * 0.5 / max(self.heading_sd, 1e-3) ** 2 + 1e-6 * np.eye(2)
         for _ in range(PASSES):
-            left = y - A @ x
-            variance = max(float(np.median(np.abs(left) ** 2)) / math.log(2.0), 1e-6)
-            weight = 1.0 / (1.0 + np.abs(left) ** 2 / (TUKEY**2 * variance))
-            N = (A.conj().T * weight) @ A / variance + np.diag(prior)
-            x = np.linalg.solve(N, (A.conj().T * weight) @ y / variance)
-        left = y - A @ x
-        variance = max(float(np.median(np.abs(left) ** 2)) / math.log(2.0), 1e-6)
-        m = 1.0 + complex(x[0])
-        sd = math.sqrt(0.5 * float(np.linalg.inv(N)[0, 0].real) * inflation(left)) / max(abs(m), 1e-3)
+            square = np.abs(w - A @ x) ** 2
+            variance = _variance(square)
+            weighted = A.conj().T / (variance + square / TUKEY**2)
+            N = weighted @ A + prior
+            x = np.linalg.solve(N, weighted @ w)
+        left, n = w - A @ x, complex(x[0])
+        sd = math.sqrt(0.5 * float(np.linalg.inv(N)[0, 0].real) * inflation(left)) / max(abs(n), 1e-3)
         spread = float(2.0 * np.sqrt(np.mean(np.abs(D) ** 2)))
-        return _Fit(m, sd, variance, left, spread)
+        return _Fit(axes.yaw - float(np.angle(n)), sd, _variance(np.abs(left) ** 2), left, spread)
 
-    def lag(
-        self, frame: str | None = None, mirrored: bool = False, step: float = LAG_STEP_S
-    ) -> tuple[float, float, float, _Fit] | None:
-        """How late the stamps are beyond what is believed [s], its sd, what it explains in chi-square, and the fit."""
+    def lag(self, axes: "_Axes") -> "_Lag | None":
+        """The lag that leaves least in some axes, turned as the fit has them; None with too few replies."""
+        found = self._lag(axes)
+        for _ in range(TURNINGS):  # tilts of the ship are those of its turned axes
+            if found is None or abs(found.fit.turn - axes.yaw) < AXIS / 3.0:
+                return found
+            axes = replace(axes, yaw=found.fit.turn)
+            turned = self._lag(axes)
+            if turned is None or turned.fit.variance > found.fit.variance:
+                return found
+            found = turned
+        return found
+
+    def _lag(self, axes: "_Axes") -> "_Lag | None":
         believed, reach = believed_lag(self.config, "usbl")[0], ACOUSTIC_TRACK.reach_s
-        lags = np.arange(-round(1.0 / step), round(reach / step) + 1) * step
-        fits = [self.fit(believed + float(lag), frame, mirrored) for lag in lags]
-        known = [(lag, fit) for lag, fit in zip(lags.tolist(), fits, strict=True) if fit is not None]
-        if len(known) < len(lags):
+        fits = {
+            lag: self.fit(believed + lag, axes) for lag in np.arange(EARLIEST_S, reach + STEP_S / 2, STEP_S).tolist()
+        }
+        if any(fit is None for fit in fits.values()):
             return None
-        best = min(fit.variance for _, fit in known)
-        cost = np.array([fit.cost(best) / len(fit.left) for _, fit in known]) * len(known[0][1].left)
-        k = int(np.argmin(cost))
-        count, zero = inflation(known[k][1].left), int(np.argmin(np.abs(lags)))
-        if not 0 < k < len(lags) - 1:
-            return float(lags[k]), np.inf, 0.0, known[k][1]
-        bend = float(cost[k - 1] - 2.0 * cost[k] + cost[k + 1]) / step**2 / count
-        seconds = lags[k] + 0.5 * (cost[k - 1] - cost[k + 1]) / step / max(bend * count, 1e-12)
-        sd = math.sqrt(2.0 / max(bend, 1e-12))
-        return float(seconds), sd, float(cost[zero] - cost[k]) / count, known[k][1]
+        best = min(fits, key=lambda lag: fits[lag].variance)
+        fits |= {lag: self.fit(believed + lag, axes) for lag in (best + FINE_S * np.arange(-2.0, 2.5)).tolist()}
+        least = min(fit.variance for fit in fits.values())
+        cost = {lag: fit.cost(least) / len(fit.left) * len(fits[best].left) for lag, fit in fits.items()}
+        best = min(cost, key=lambda lag: cost[lag])
+        fit = fits[best]
+        count = inflation(fit.left)
+        sides = [self.fit(believed + best + side * FINE_S, axes) for side in (-1.0, 1.0)]
+        before, after = (one.cost(least) / len(one.left) * len(fit.left) for one in sides)
+        bend = max((before - 2.0 * cost[best] + after) / FINE_S**2, 1e-12)
+        seconds = best + 0.5 * (before - after) / FINE_S / bend
+        as_stated = cost[min(cost, key=abs)]
+        inner = EARLIEST_S < best < reach
+        return _Lag(seconds, math.sqrt(2.0 * count / bend) if inner else np.inf, (as_stated - cost[best]) / count, fit)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Those in which directions are taken: ``usbl.frame``, bearings of the other sense, and turned by a yaw [rad]."""
+
+    frame: str
+    mirrored: bool = False
+    yaw: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Lag:
+    """How late stamps are beyond what is believed [s], its sd, what that explains in chi-square, and the fit there."""
+
+    seconds: float
+    sd: float
+    evidence: float
+    fit: _Fit
 
 
 def _signed(stream: Stream, bearing: float = 1.0, elevation: float = 1.0) -> Stream:
@@ -268,45 +309,38 @@ def positions(log: Log, config: Config) -> Iterator[Finding]:
     """Axes, frame, turn and clock of acoustic positions against the DVL's track."""
     upside_down = _elevations_reversed(log, config)
     beside = _Beside.of(_with(log, _signed(log["usbl"], elevation=-1.0)) if upside_down else log, config)
-    found = None if beside is None else beside.lag()
+    as_named = _Axes(config.usbl.frame)
+    found = None if beside is None else beside.lag(as_named)
     if beside is None or found is None:
         return
-    seconds, sd, evidence, late = found
+    late = found.fit
+    if late.spread > ENOUGH_DISTANCE and not late.explained and (other := _other_axes(beside, late)):
+        yield Finding("usbl", "warning", *other)
+        return
     if late.spread < max(ENOUGH_DISTANCE, SURE * math.sqrt(late.variance)):
         yield Finding("usbl", "ok", "too little movement to compare acoustic positions with the DVL's track")
         return
-    if other := _other_axes(beside, late):
-        yield Finding("usbl", "warning", *other)
-        return
-    is_late = evidence > ACOUSTIC_TRACK.evidence and ACOUSTIC_TRACK.is_late(seconds, sd, (0.0, _lag_sd(config)))
-    fit = late if is_late else beside.fit(believed_lag(config, "usbl")[0])
+    believed, sd = believed_lag(config, "usbl")
+    is_late = found.evidence > ACOUSTIC_TRACK.evidence and ACOUSTIC_TRACK.is_late(found.seconds, found.sd, (0.0, sd))
+    yaw = late.turn if abs(late.turn) > AXIS else 0.0
+    fit = late if is_late else beside.fit(believed, replace(as_named, yaw=yaw))
     if fit is not None:
         yield from _turned(config, fit)
     if is_late:
-        total = believed_lag(config, "usbl")[0] + seconds
+        total = believed + found.seconds
         text = (
             f"acoustic positions come {abs(total):.1f} s {'late' if total > 0.0 else 'early'} beside the DVL's track "
         )
-        text += f"and the ship's (sd {sd:.2f} s): {remedy_of_lag(config, 'usbl', total, sd)}"
+        text += f"and the ship's (sd {found.sd:.2f} s): {remedy_of_lag(config, 'usbl', total, found.sd)}"
         yield Finding("usbl", "warning", text, "lag")
-
-
-def _lag_sd(config: Config) -> float:
-    return believed_lag(config, "usbl")[1]
 
 
 def _other_axes(beside: _Beside, as_is: _Fit) -> tuple[str, str] | None:
     """Text and kind of other axes that explain the replies far better, by whichever needs the smallest turn."""
     config, own = beside.config, beside.config.usbl.frame
-    tried: list[tuple[str, bool, _Fit]] = []
-    for frame in FRAMES:
-        for mirrored in (False, True):
-            if (frame, mirrored) == (own, False):
-                continue
-            found = beside.lag(frame, mirrored, COARSE_S)
-            if found is not None:
-                tried.append((frame, mirrored, found[3]))
-    good = [one for one in tried if one[2].better(as_is)]
+    every = [_Axes(frame, mirrored) for frame in FRAMES for mirrored in (False, True)]
+    tried = [(axes.frame, axes.mirrored, beside.lag(axes)) for axes in every if axes != _Axes(own)]
+    good = [(frame, mirrored, lag.fit) for frame, mirrored, lag in tried if lag is not None and lag.fit.better(as_is)]
     if not good:
         return None
     least = min(fit.variance for *_, fit in good)
@@ -344,7 +378,7 @@ def _mirrored(log: Log, config: Config, fit: _Fit, frame: str, residuals: str) -
         remedy = f"state columns: {{usbl_x: {y}, usbl_y: {x}}}"
     else:
         remedy = f"state units: {{{_negated(config, 'usbl_y' if by_place else 'usbl_bearing')}}}"
-        remedy += "" if exact and quarter == 0 else f" and {_yaw(config, fit.turn)}"
+        remedy += "" if exact and quarter == 0 else f" and {_yaw(config, 0.5 * np.pi * quarter if exact else fit.turn)}"
     return f"{what}: corrected, {residuals} beside the DVL's track; {remedy}{also}"
 
 
@@ -359,7 +393,7 @@ def _yaw(config: Config, turn: float) -> str:
     """Entry of the head's mounting that turns its directions."""
     roll, pitch, yaw = config.usbl.mount_rpy_deg
     new = math.degrees(float(wrap_angle(np.array([math.radians(yaw) + turn]))[0]))
-    return f"usbl.mount_rpy_deg: [{roll:g}, {pitch:g}, {new:.0f}]"
+    return f"usbl.mount_rpy_deg: [{roll:g}, {pitch:g}, {round(new)}]"
 
 
 def _turned(config: Config, fit: _Fit) -> Iterator[Finding]:
@@ -373,7 +407,7 @@ def _turned(config: Config, fit: _Fit) -> Iterator[Finding]:
     twice = abs(fit.turn) > max(TWICE, SURE * fit.sd) and abs(fit.turn + stated) < max(0.5 * TWICE, 3.0 * fit.sd)
     if twice and abs(stated) > TWICE:
         yield Finding(
-            "usbl", "warning", f"{text}: usbl.mount_rpy_deg is applied twice; state {_yaw(config, fit.turn)}", "turned"
+            "usbl", "warning", f"{text}: usbl.mount_rpy_deg is applied twice; state {_yaw(config, -stated)}", "turned"
         )
     elif abs(fit.turn - off) > believed + SURE * fit.sd:
         text += (
@@ -445,8 +479,10 @@ def _is_given(log: Log, config: Config, seen: Sightings) -> bool:
     found = _depth_errors(log, config, "north" if config.usbl.frame == "north" else "ship")
     if found is None:
         return False
-    level = found[0]
-    noise = 1.4826 * float(np.median(np.abs(level - np.median(level))))
+    errors, _, level = found  # with the head's own depth, which the ship's tilt changes, and without
+    down = level.positions.data[:, 2] - level.head[:, 2]
+    relative = down - np.interp(level.positions.time, log["depth"].time, log["depth"]["depth"])
+    noise = 1.4826 * min(float(np.median(np.abs(each - np.median(each)))) for each in (errors, relative))
     w = seen.positions.data[:, :3] - seen.head
     away, length = np.hypot(w[:, 0], w[:, 1]), np.linalg.norm(w, axis=1)
     telling = away > NEAR_AXIS * length
