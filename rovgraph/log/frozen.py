@@ -454,7 +454,7 @@ def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
 
 
 def _answered_again(stream: Stream) -> Iterator[FrozenStretch]:
-    """Acoustic measurements that repeat the one before of the same beacon, as a system has them that is asked too often.
+    """Acoustic measurements that repeat the one before of that beacon, as a system has them that is asked too often.
 
     Those are taken to be new that come at the time of others that are.
     """

@@ -458,12 +458,10 @@ class Sightings(NamedTuple):
     ----------
     positions : north, east, down and sd [m]
     head : where the head was, shape (n, 3) [m]
-    unused : reason -> count of the replies that cannot be used
     """
 
     positions: Stream
     head: Array
-    unused: dict[str, int]
 
 
 def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], late: float = 0.0) -> Sightings | None:
@@ -475,9 +473,9 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     """
     if "usbl" not in log or config.usbl.head != "ship" or "usbl" not in instruments:
         return None
-    acoustics, left_out = Acoustics(config, instruments), Left()
+    acoustics = Acoustics(config, instruments)
     acoustics.take_ship(log.streams)
-    stream = acoustics.exchanges(log["usbl"], late, left_out)
+    stream = acoustics.exchanges(log["usbl"], late, Counter())
     z, sd, x = stream.data[:, :3], stream.data[:, 3:6], stream.data[:, 6 : 6 + at.WIDTH]
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
     head = x[:, at.HEARD : at.HEARD + 3]
@@ -486,7 +484,7 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     columns = "fix_north", "fix_east", "down", "fix_sd"
     data = np.column_stack([p, np.hypot(across, sd[:, 0])])
     positions = Stream("usbl", columns, stream.time - late, data, stream.row)
-    return Sightings(positions, head, {reason: count for (_, reason), count in left_out.items()})
+    return Sightings(positions, head)
 
 
 def unusable_acoustics(config: Config, sensors: Collection[str]) -> dict[str, str]:

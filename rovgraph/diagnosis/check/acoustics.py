@@ -13,6 +13,7 @@ is named where it leaves far smaller residuals.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -33,8 +34,9 @@ from rovgraph.diagnosis.check.inertial import in_gap
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log import Log, Stream
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, beliefs
-from rovgraph.problem.acoustics import Sightings, sightings, unusable_acoustics
+from rovgraph.problem.acoustics import Acoustics, Sightings, sightings, unusable_acoustics
 from rovgraph.rules import ACOUSTIC_TRACK, BELIEVED_SDS, SURE, USUAL_SHARE, remedy_of_lag
 from rovgraph.sensors.acoustic import in_degrees
 from rovgraph.sensors.instruments import heading_sources, instruments
@@ -53,7 +55,7 @@ TELLING = np.deg2rad(5.0)  # sd of the yaw, up to which it is reported
 OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
 DEPTH_OFF_M = 1.0
 GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
-COARSE_M = 0.1  # resolution of depths that such systems pass on
+COARSE_M = 0.05  # noise of depths that are passed on with one digit
 NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
 COURSE_S, UNDER_WAY_MPS = 10.0, 1.0  # over which a course is taken, and the speed from which on it is one
 ENOUGH_COURSES = 6
@@ -92,10 +94,10 @@ def _wrong_unit(log: Log) -> bool:
     )
 
 
-def _sound(log: Log, config: Config) -> Stream:
-    """Replies that can be true."""
-    stream = log["usbl"]
-    bad = [mask for _, mask in SENSORS["usbl"].refused(stream.data, config)]
+def _sound(log: Log, config: Config, sensor: str = "usbl") -> Stream:
+    """Replies or ranges that can be true."""
+    stream = log[sensor]
+    bad = [mask for _, mask in SENSORS[sensor].refused(stream.data, config)]
     return stream.take(~np.any(bad, axis=0))
 
 
@@ -105,46 +107,58 @@ def _with(log: Log, stream: Stream) -> Log:
 
 def replies(log: Log, config: Config) -> Iterator[Finding]:
     """Replies and ranges that cannot be used, by the ship's log, the beacons and the values themselves."""
-    for sensor, why in unusable_acoustics(config, log.sensors).items():
-        yield Finding(sensor, "warning", f"it is left out: {why}", "missing")
-    if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors) and not _wrong_unit(log):
-        stream = log["usbl"]
-        refused = {why: int(mask.sum()) for why, mask in SENSORS["usbl"].refused(stream.data, config)}
-        sound = _sound(log, config)
-        try:
-            seen = sightings(_with(log, sound), config, instruments(config)) if len(sound) else None
-        except InputError as error:
-            yield Finding("usbl", "error", str(error).removeprefix("usbl: "), "missing")
-            return
-        unused = refused | ({} if seen is None else seen.unused)
-        for why, count in unused.items():
-            if count:
-                yield _unused(log, config, why, count, len(stream))
+    unusable = unusable_acoustics(config, log.sensors)
+    alone = not (log.sensors - unusable.keys()) & {"dvl", "fix", *ACOUSTICS}
+    for sensor in ACOUSTICS:
+        if sensor in unusable:
+            yield Finding(sensor, "error" if alone else "warning", f"it is left out: {unusable[sensor]}", "missing")
+        elif sensor in log and not _wrong_unit(log):
+            refused = SENSORS[sensor].refused(log[sensor].data, config)
+            unused = Counter({(sensor, why): int(mask.sum()) for why, mask in refused})
+            acoustics = Acoustics(config, instruments(config))
+            acoustics.take_ship(log.streams)
+            try:
+                acoustics.exchanges(_sound(log, config, sensor), 0.0, unused)
+            except InputError as error:
+                yield Finding(sensor, "error", str(error).removeprefix(f"{sensor}: "), "missing")
+                continue
+            yield from (_unused(log, config, sensor, why, count) for (_, why), count in unused.items() if count)
 
 
-def _unused(log: Log, config: Config, why: str, count: int, of: int) -> Finding:
-    """Replies that are left out, and what would mend it."""
-    text, tail = f"{count} of {of} replies ({count / of:.1%}) are left out: {why}", ""
+def _unused(log: Log, config: Config, sensor: str, why: str, count: int) -> Finding:
+    """What is left out, and what would mend it."""
+    of, what = len(log[sensor]), "replies" if sensor == "usbl" else "ranges"
+    text, level = f"{count} of {of} {what} ({count / of:.1%}) are left out: {why}", count > USUAL_SHARE * of
     if why.endswith("of the ship"):
-        sensor = "ship" if "position" in why else "ship_heading"
-        tail = f"; {_extent(log, sensor)}, and is interpolated over up to ship.max_gap_s = {config.ship.max_gap_s:g} s"
+        text += f"; {_extent(log, config, 'ship' if 'position' in why else 'ship_heading')}"
     elif "usbl.beacon" in why:
-        names = np.unique(log["usbl"]["usbl_beacon"])
-        shown = ", ".join(f"{name:g}" for name in names[~np.isnan(names)][:6].tolist())
-        tail = f"; usbl.beacon is {config.usbl.beacon}, the log has {shown}"
-        if count < of:
-            return Finding("usbl", "ok", text + tail)
-    return Finding("usbl", "warning" if count > USUAL_SHARE * of else "ok", text + tail, "missing")
+        text += f"; usbl.beacon is {config.usbl.beacon}, the log has {_names(log[sensor])}"
+        level = count == of  # others may answer beside the vehicle's
+    elif "beacon" in why:
+        named = ", ".join(str(beacon.name) for beacon in config.beacons) or "none"
+        text += f"; it names {named}, the log has {_names(log[sensor])}"
+    return Finding(sensor, "warning" if level else "ok", text, "missing")
 
 
-def _extent(log: Log, sensor: str) -> str:
-    """From when to when the ship is known, and its longest silence."""
+def _names(stream: Stream) -> str:
+    """Transponders or beacons in a log, numbers as they are."""
+    found = np.unique(stream[f"{stream.sensor}_beacon"])
+    found = found[~np.isnan(found)]
+    shown = [f"{name:g}" for name in found[found < 2.0**32][:6].tolist()]
+    words = int((found >= 2.0**32).sum())  # `label_number` of texts
+    return ", ".join(shown + [f"{words} {'others' if shown else 'names'} in words"] * (words > 0)) or "no names"
+
+
+def _extent(log: Log, config: Config, sensor: str) -> str:
+    """From when to when the ship is known, and the longest silence that nothing bridges."""
     if sensor not in log:
-        return f"{sensor} is not in the log"
-    time = log[sensor].time
-    text = f"{sensor} begins at {since(log, time[0])}, ends at {since(log, time[-1])}"
-    k = int(np.argmax(np.diff(time))) if len(time) > 1 else -1
-    return text + (f", is silent for {time[k + 1] - time[k]:.1f} s from {since(log, time[k])} on" if k >= 0 else "")
+        return f"the log has no {sensor}"
+    time, longest = log[sensor].time, config.ship.max_gap_s
+    text = f"{sensor} begins at {since(log, time[0])} and ends at {since(log, time[-1])}"
+    gaps = np.diff(time, append=time[-1])
+    k = int(np.argmax(gaps))
+    silent = f", is silent for {gaps[k]:.1f} s from {since(log, time[k])} on" if gaps[k] > longest else ""
+    return f"{text}{silent}; ship.max_gap_s = {longest:g} s bridges no more"
 
 
 @dataclass(frozen=True)
