@@ -285,14 +285,16 @@ class _Beside:
         cost = {lag: fit.cost(least) / len(fit.left) * len(fits[best].left) for lag, fit in fits.items()}
         best = min(cost, key=lambda lag: cost[lag])
         fit = fits[best]
-        count = inflation(fit.left)
+        stated = min(cost, key=abs)
+        count = max(inflation(fit.left), inflation(fits[stated].left))  # what wanders slowly looks like a lag
         sides = [self.fit(believed + best + side * FINE_S, axes) for side in (-1.0, 1.0)]
         before, after = (one.cost(least) / len(one.left) * len(fit.left) for one in sides)
         bend = max((before - 2.0 * cost[best] + after) / FINE_S**2, 1e-12)
         seconds = best + 0.5 * (before - after) / FINE_S / bend
-        as_stated = cost[min(cost, key=abs)]
         inner = EARLIEST_S < best < reach
-        return _Lag(seconds, math.sqrt(2.0 * count / bend) if inner else np.inf, (as_stated - cost[best]) / count, fit)
+        return _Lag(
+            seconds, math.sqrt(2.0 * count / bend) if inner else np.inf, (cost[stated] - cost[best]) / count, fit
+        )
 
 
 @dataclass(frozen=True)
