@@ -83,9 +83,10 @@ class Track:
         if self.held is not None:
             return np.tile(self.held, (len(time), 1)), np.zeros((len(time), self.width))
         if len(self.time) < 2:
-            near = np.abs(time - self.time[0]) <= longest if len(self.time) else np.zeros(len(time), bool)
-            values = np.where(near[:, None], self.values[:1] if len(self.time) else np.nan, np.nan)
-            return values.reshape(len(time), self.width), np.zeros((len(time), self.width))
+            values = np.full((len(time), self.width), np.nan)
+            if len(self.time):
+                values[np.abs(time - self.time[0]) <= longest] = self.values[0]
+            return values, np.zeros((len(time), self.width))
         k = self.time.searchsorted(time).clip(1, len(self.time) - 1)
         step = (self.time[k] - self.time[k - 1])[:, None]
         change = self.values[k] - self.values[k - 1]

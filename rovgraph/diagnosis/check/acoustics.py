@@ -14,7 +14,7 @@ is named where it leaves far smaller residuals.
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -273,28 +273,34 @@ class _Beside:
         return found
 
     def _lag(self, axes: "_Axes") -> "_Lag | None":
-        believed, reach = believed_lag(self.config, "usbl")[0], ACOUSTIC_TRACK.reach_s
-        fits = {
-            lag: self.fit(believed + lag, axes) for lag in np.arange(EARLIEST_S, reach + STEP_S / 2, STEP_S).tolist()
-        }
-        if any(fit is None for fit in fits.values()):
+        reach = ACOUSTIC_TRACK.reach_s
+        fits = self._fits([0.0, *np.arange(EARLIEST_S, reach + STEP_S / 2, STEP_S).tolist()], axes)
+        if not fits:
             return None
         best = min(fits, key=lambda lag: fits[lag].variance)
-        fits |= {lag: self.fit(believed + lag, axes) for lag in (best + FINE_S * np.arange(-2.0, 2.5)).tolist()}
-        least = min(fit.variance for fit in fits.values())
-        cost = {lag: fit.cost(least) / len(fit.left) * len(fits[best].left) for lag, fit in fits.items()}
-        best = min(cost, key=lambda lag: cost[lag])
-        fit = fits[best]
-        stated = min(cost, key=abs)
-        count = max(inflation(fit.left), inflation(fits[stated].left))  # what wanders slowly looks like a lag
-        sides = [self.fit(believed + best + side * FINE_S, axes) for side in (-1.0, 1.0)]
-        before, after = (one.cost(least) / len(one.left) * len(fit.left) for one in sides)
-        bend = max((before - 2.0 * cost[best] + after) / FINE_S**2, 1e-12)
-        seconds = best + 0.5 * (before - after) / FINE_S / bend
-        inner = EARLIEST_S < best < reach
-        return _Lag(
-            seconds, math.sqrt(2.0 * count / bend) if inner else np.inf, (cost[stated] - cost[best]) / count, fit
-        )
+        fits |= self._fits((best + FINE_S * np.arange(-2.0, 2.5)).tolist(), axes)
+        least, several = min(fit.variance for fit in fits.values()), len(fits[best].left)
+
+        def cost(fit: _Fit) -> float:  # not all lags leave equally many replies inside
+            return fit.cost(least) / len(fit.left) * several
+
+        best = min(fits, key=lambda lag: cost(fits[lag]))
+        fit, sides = fits[best], self._fits([best - FINE_S, best + FINE_S], axes)
+        if not sides:
+            return None
+        count = max(inflation(fit.left), inflation(fits[0.0].left))  # what wanders slowly looks like a lag
+        before, after = (cost(side) for side in sides.values())
+        bend = max((before - 2.0 * cost(fit) + after) / FINE_S**2, 1e-12)
+        sd = math.sqrt(2.0 * count / bend) if EARLIEST_S < best < reach else np.inf
+        evidence = (cost(fits[0.0]) - cost(fit)) / count
+        return _Lag(best + 0.5 * (before - after) / FINE_S / bend, sd, evidence, fit)
+
+    def _fits(self, lags: Sequence[float], axes: "_Axes") -> dict[float, _Fit]:
+        """Fits with stamps that are later than believed; none if one of them has too few replies."""
+        believed = believed_lag(self.config, "usbl")[0]
+        fits = {lag: self.fit(believed + lag, axes) for lag in lags}
+        known = {lag: fit for lag, fit in fits.items() if fit is not None}
+        return known if len(known) == len(fits) else {}
 
 
 @dataclass(frozen=True)
@@ -331,7 +337,7 @@ def positions(log: Log, config: Config) -> Iterator[Finding]:
         return
     late = found.fit
     if late.spread > ENOUGH_DISTANCE and not late.explained and (other := _other_axes(beside, late)):
-        yield Finding("usbl", "warning", *other)
+        yield Finding("usbl", "warning", other, "axes")
         return
     if late.spread < max(ENOUGH_DISTANCE, SURE * math.sqrt(late.variance)):
         yield Finding("usbl", "ok", "too little movement to compare acoustic positions with the DVL's track")
@@ -351,25 +357,25 @@ def positions(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", text, "lag")
 
 
-def _other_axes(beside: _Beside, as_is: _Fit) -> tuple[str, str] | None:
-    """Text and kind of other axes that explain the replies far better, by whichever needs the smallest turn."""
+def _other_axes(beside: _Beside, as_is: _Fit) -> str:
+    """Other axes that explain the replies far better, by whichever is nearest to those that are stated; "" = none."""
     config, own = beside.config, beside.config.usbl.frame
     every = [_Axes(frame, mirrored) for frame in FRAMES for mirrored in (False, True)]
     tried = [(axes.frame, axes.mirrored, beside.lag(axes)) for axes in every if axes != _Axes(own)]
     good = [(frame, mirrored, lag.fit) for frame, mirrored, lag in tried if lag is not None and lag.fit.better(as_is)]
     if not good:
-        return None
+        return ""
     least = min(fit.variance for *_, fit in good)
     close = [one for one in good if one[2].variance < BETTER * least]
     frame, mirrored, fit = min(close, key=lambda one: (one[1], abs(one[2].turn) > AXIS, one[0] != own, one[2].variance))
     residuals = f"{math.sqrt(fit.variance):.1f} m is left instead of {math.sqrt(as_is.variance):.1f} m"
     if mirrored:
-        return _mirrored(beside.log, config, fit, frame, residuals), "axes"
+        return _mirrored(beside.log, config, fit, frame, residuals)
     turned = "" if abs(fit.turn) < AXIS else f" and {_yaw(config, fit.turn)}"
     text = (
         f"its directions fit the DVL's track in axes of the frame {frame}: {residuals}; state usbl: {{frame: {frame}}}"
     )
-    return text + turned, "axes"
+    return text + turned
 
 
 def _mirrored(log: Log, config: Config, fit: _Fit, frame: str, residuals: str) -> str:
@@ -471,14 +477,14 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
     off = float(np.median(errors))
     noise = 1.4826 * float(np.median(np.abs(errors - off)))
     text = f"depths by range and direction are {off:+.2f} m off the depth sensor's (noise {noise:.2f} m)"
-    length = float(np.median(np.hypot(away, errors + seen.positions.data[0, 2])))
+    length = float(np.median(np.linalg.norm(seen.positions.data[:, :3] - seen.head, axis=1)))
     priors = beliefs(config)
     parts = (
         *(priors[name].sd * float(np.median(away)) for name in ("usbl_roll", "usbl_pitch")),
         priors["sound_speed_scale"].sd * length,
         priors["usbl_arm"].sd,
     )
-    sd = 1.2533 * noise * math.sqrt(inflation(errors - off + 0j) / len(errors))
+    sd = 1.2533 * noise * math.sqrt(inflation((errors - off).astype(np.complex128)) / len(errors))
     if abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
         x, y, z = config.usbl.lever_arm_m
         text += f": check the head's depth below the waterline, usbl.lever_arm_m: [{x:g}, {y:g}, {z - off:.1f}] would "
@@ -530,11 +536,9 @@ def ship(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("ship_heading", "ok", text)
     elif several and abs(against) > CONCENTRATED:
         zero = round(float(np.angle(against)) / (0.5 * np.pi)) % 4
-        remedy = {0: "nwu", 1: "enu"}.get(zero)
+        kind = {0: "nwu", 1: "enu"}.get(zero)
         text = "it turns opposite to the ship's course: it counts anticlockwise"
-        text += (
-            f"; state angles: {{ship_heading: {remedy}}}" if remedy else ", from another direction than north or east"
-        )
+        text += f"; state angles: {{ship_heading: {kind}}}" if kind else ", from another direction than north or east"
         yield Finding("ship_heading", "warning", text, "sign")
 
 
