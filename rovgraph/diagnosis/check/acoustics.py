@@ -257,13 +257,14 @@ class _Beside:
         left, n = w - A @ x, complex(x[0])
         sd = math.sqrt(0.5 * float(np.linalg.inv(N)[0, 0].real) * inflation(left)) / max(abs(n), 1e-3)
         spread = float(2.0 * np.sqrt(np.mean(np.abs(D) ** 2)))
-        return _Fit(axes.yaw - float(np.angle(n)), sd, _variance(np.abs(left) ** 2), left, spread)
+        turn = float(np.angle(np.exp(1j * axes.yaw) / n))
+        return _Fit(turn, sd, _variance(np.abs(left) ** 2), left, spread)
 
     def lag(self, axes: "_Axes") -> "_Lag | None":
         """The lag that leaves least in some axes, turned as the fit has them; None with too few replies."""
         found = self._lag(axes)
         for _ in range(TURNINGS):  # tilts of the ship are those of its turned axes
-            if found is None or abs(found.fit.turn - axes.yaw) < AXIS / 3.0:
+            if found is None or abs(np.angle(np.exp(1j * (found.fit.turn - axes.yaw)))) < AXIS / 3.0:
                 return found
             axes = replace(axes, yaw=found.fit.turn)
             turned = self._lag(axes)
