@@ -68,7 +68,9 @@ TURNING = MotionLimits("turning by compass and gyro", FOLLOWS, 0.3, 3.0, 2.0, RE
 DESCENT = TURNING._replace(compared="descent by DVL and depth", evidence=12.0)  # waves are alike after a period
 # fixes are seldom, and scatter
 TRACK = MotionLimits("track by DVL and fixes", 0.6, 0.5, SURE, 40.0, 60.0)
-COMPARISONS = (ACCELERATION, TURNING, DESCENT, TRACK)
+# a lag moves the ship as well; systems are up to 3 s late, and at most a second early
+ACOUSTIC_TRACK = TRACK._replace(compared="track by DVL and acoustic positions", lag_s=0.3, reach_s=5.0)
+COMPARISONS = (ACCELERATION, TURNING, DESCENT, TRACK, ACOUSTIC_TRACK)
 
 
 @dataclass(frozen=True)
@@ -195,6 +197,9 @@ def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
         entry = f"{{estimate: true, mean: {lag:.3f}, sd: {max(0.02, 3.0 * sd):.2f}}}"
         return f"correct its clock, or state calibration.dvl_time_offset: {entry}"
     delay = f"state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + lag:.2g}}}"
+    if sensor == "usbl":
+        entry = f"{{estimate: true, mean: {lag:.2g}, sd: {max(0.1, 3.0 * sd):.2g}}}"
+        return f"{delay}, or calibration.usbl_time_offset: {entry}"
     return f"{delay}, or correct fix.lever_arm_m" if sensor == "fix" else delay  # under way the two are alike
 
 

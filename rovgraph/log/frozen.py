@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, rotate, wrap_angle
 from rovgraph.log.log import Log
-from rovgraph.log.streams import Stream, integral
+from rovgraph.log.streams import Stream, integral, labels
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, mount_matrix
 
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
@@ -274,6 +275,9 @@ def false_values(log: Log, config: Config) -> list[FrozenStretch]:
             known = stream.take(np.asarray(told))
             halves = [*_halves(known, company)]
             found += [*halves, *_repeated(without(known, halves))]
+    for sensor in ACOUSTICS:
+        if sensor in log:
+            found += _answered_again(log[sensor])
     return found
 
 
@@ -447,6 +451,24 @@ def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
         ends = np.cumsum(runs.count)[short]
         index = np.concatenate([np.arange(b - n + 1, b) for b, n in zip(ends, runs.count[short], strict=True)])
         yield FrozenStretch(pings.sensor, "repeated", pings.time[index], "values hardly ever return otherwise", True)
+
+
+def _answered_again(stream: Stream) -> Iterator[FrozenStretch]:
+    """Acoustic measurements that repeat the one before of that beacon, as a system has them that is asked too often.
+
+    Those are taken to be new that come at the time of others that are.
+    """
+    names = [stream.columns.index(name) for name in stream.columns if name in labels()]
+    of = np.unique(np.nan_to_num(stream.data[:, names], nan=-1.0), axis=0, return_inverse=True)[1].ravel()
+    again = np.zeros(len(stream), bool)
+    for k in range(of.max(initial=-1) + 1):
+        values = stream.data[of == k]
+        same, fresh = repeats(values), values[~repeats(values)]
+        returns = int(repeats(fresh[::2]).sum() + repeats(fresh[1::2]).sum())
+        if same.sum() >= HOLD.repeats and same.sum() > CHANCE * returns and _noise_shows(np.nan_to_num(fresh)):
+            again[of == k] = same
+    if (time := stream.time[again & ~np.isin(stream.time, stream.time[~again])]).size:
+        yield FrozenStretch(stream.sensor, "repeated", time, "values hardly ever return otherwise", True)
 
 
 def is_false_zero(company: Company, at: float, time: Array, values: Array) -> bool:

@@ -46,6 +46,7 @@ _ATTITUDES: dict[str, tuple[tuple[str, str, str], float]] = {
     "ahrs": (("ahrs_roll", "ahrs_pitch", "ahrs_yaw"), np.pi),
     "attitude": (("roll", "pitch", "heading"), 0.0),
     "dvl_heading": (("", "", "dvl_heading"), 0.0),
+    "ship_heading": (("", "", "ship_heading"), 0.0),
 }
 
 _Values = TypeVar("_Values", float, Array)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_origin
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, create_model, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, create_model, field_validator, model_validator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
@@ -306,6 +306,14 @@ class Config(ConfigSection):
         {},
         description="sensor: how much older its measurements are than their stamps, in a log and online; e.g. fix: 2",
     )
+
+    @field_validator("beacons")
+    @classmethod
+    def _of_different_names(cls, beacons: tuple[Beacon, ...]) -> tuple[Beacon, ...]:
+        names = [str(beacon.name).strip() for beacon in beacons]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise PydanticCustomError("named_twice", f"expected different names, two beacons are named {twice}")
+        return beacons
 
     @model_validator(mode="before")
     @classmethod

@@ -241,10 +241,21 @@ class ShipSettings(ConfigSection):
     )
 
 
+def _in_water(mps: float) -> float:
+    """Refuses what is no speed of sound in water in m/s."""
+    low, high = 1300.0, 1700.0
+    if not low <= mps <= high:
+        feet = f"; if it is in ft/s, state {mps * 0.3048:.0f}" if low <= mps * 0.3048 <= high else ""
+        raise PydanticCustomError("in_water", f"expected a speed of sound from {low:g} to {high:g} m/s{feet}")
+    return mps
+
+
 class AcousticSettings(ConfigSection):
     """Keys that directions and ranges share."""
 
-    sound_speed_mps: Positive = Field(1500.0, description="speed of sound that ranges were made with, and travel times")
+    sound_speed_mps: Annotated[float, AfterValidator(_in_water)] = Field(
+        1500.0, description="speed of sound that ranges were made with, and travel times"
+    )
     stamp: Literal["reply", "transponder", "arrival"] = Field(
         "reply",
         description="what a stamp is the time of: the reply at the head, the question at the transponder, "
@@ -432,7 +443,8 @@ class DateSettings(ConfigSection):
 COLUMNS_TEXT = "rovgraph's column: the log's own name for it"
 UNITS_TEXT = "column or sensor: unit it is in, e.g. gyr: deg/s"
 ANGLES_TEXT = (
-    "ahrs, attitude, dvl_heading, or a column: how its heading counts; ned, enu or nwu (axes forward, port, up), east"
+    "ahrs, attitude, dvl_heading, ship_heading, or a column: how its heading counts; ned, enu or nwu (axes forward, "
+    "port, up), east"
 )
 Angles = dict[str, Literal["ned", "enu", "nwu", "east"]]
 

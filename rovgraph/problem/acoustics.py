@@ -535,17 +535,44 @@ def rough_positions(log: Log, config: Config, instruments: Mapping[str, Instrume
 
     Of a head on the ship, by its nominal mounting; to begin with, to search with and to draw.
     """
+    found = sightings(log, config, instruments)
+    return None if found is None else found.positions
+
+
+class Sightings(NamedTuple):
+    """Where acoustic directions and ranges put the vehicle by themselves.
+
+    Attributes
+    ----------
+    positions : north, east, down and sd [m]
+    head : where the head was, shape (n, 3) [m]
+    """
+
+    positions: Stream
+    head: Array
+
+
+def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], late: float = 0.0) -> Sightings | None:
+    """Positions as `rough_positions` has them, of replies whose stamps are late [s]; None without a head on the ship.
+
+    Raises
+    ------
+    InputError : it is not known which transponder is the vehicle's
+    """
     if "usbl" not in log or config.usbl.head != "ship" or "usbl" not in instruments:
         return None
     acoustics = Acoustics(config, instruments)
     acoustics.take_ship(log.streams)
-    stream = acoustics.exchanges(log["usbl"], 0.0, Counter())
+    stream = acoustics.exchanges(log["usbl"], late, Counter())
     z, sd, x = stream.data[:, :3], stream.data[:, 3:6], stream.data[:, 6 : 6 + at.WIDTH]
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
-    p = x[:, at.HEARD : at.HEARD + 3] + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
+    head = x[:, at.HEARD : at.HEARD + 3]
+    p = head + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
     across = z[:, 0] * np.max(sd[:, 1:], axis=1)
     columns = "fix_north", "fix_east", "down", "fix_sd"
-    return Stream("usbl", columns, stream.time, np.column_stack([p, np.hypot(across, sd[:, 0])]), stream.row)
+    data = np.column_stack([p, np.hypot(across, sd[:, 0])])
+    positions = Stream("usbl", columns, stream.time - late, data, stream.row)
+    return Sightings(positions, head)
 
 
 def unusable_acoustics(config: Config, sensors: Collection[str]) -> dict[str, str]:

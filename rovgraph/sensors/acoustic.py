@@ -17,7 +17,7 @@ from rovgraph.model.calibration import USBL_MOUNT, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
-from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instrument
+from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
 SLOWEST_MPS = 1400.0  # sound in water
@@ -116,6 +116,40 @@ def _is_range(values: Array) -> NDArray[np.bool_]:
     return np.asarray(~np.isnan(values[:, :2]).all(axis=1))
 
 
+DEGREES = 0.1  # share of angles beyond a full circle, which only degrees have
+LARGEST_TILT = 0.35  # rms of a ship's roll or pitch [rad]
+
+
+def in_degrees(angles: Array) -> NDArray[np.bool_]:
+    """Which columns of (n, k) angles are in degrees by their numbers, bearing or heading and elevation, shape (k,)."""
+    beyond = np.abs(angles) > np.array([2.0 * np.pi + 0.01, MOST_ELEVATION])[: angles.shape[1]]
+    return np.asarray(beyond.sum(axis=0) > DEGREES * np.maximum(np.isfinite(angles).sum(axis=0), 1))
+
+
+def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
+    bearing, elevation = in_degrees(values[:, 2:4])
+    if bearing or elevation:
+        key = "usbl_direction" if bearing and elevation else "usbl_bearing" if bearing else "usbl_elevation"
+        largest = float(np.nanmax(np.abs(values[:, 2:4])))
+        yield (
+            "error",
+            f"its angles reach {largest:.4g} rad; if they are in degrees, state units: {{{key}: deg}}",
+            "unit",
+        )
+
+
+def _look_at_heading(values: Array, config: Config) -> Iterator[Said]:
+    if in_degrees(values).any():
+        text = f"it reaches {np.abs(values).max():.4g} rad; if it is in degrees, state units: {{ship_heading: deg}}"
+        yield "error", text, "unit"
+
+
+def _look_at_tilt(values: Array, config: Config) -> Iterator[Said]:
+    if (rms := float(np.sqrt(np.mean(values**2, axis=0)).max())) > LARGEST_TILT:
+        text = f"roll or pitch is {rms:.2g} rad rms; if they are in degrees, state units: {{ship_tilt: deg}}"
+        yield "error", text, "unit"
+
+
 USBL = Sensor(
     "usbl",
     (
@@ -134,6 +168,7 @@ USBL = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_reply,
+    look=_look_at_directions,
 )
 RANGE = Sensor(
     "range",
@@ -162,11 +197,16 @@ SHIP = Sensor(
     occasional=True,
 )
 SHIP_HEADING = Sensor(
-    "ship_heading", (Column("ship_heading", "angle"),), may_begin_later=True, usual_rates=(0.2, 1000.0)
+    "ship_heading",
+    (Column("ship_heading", "angle"),),
+    may_begin_later=True,
+    usual_rates=(0.2, 1000.0),
+    look=_look_at_heading,
 )
 SHIP_TILT = Sensor(
     "ship_tilt",
     (Column("ship_roll", "angle"), Column("ship_pitch", "angle")),
     may_begin_later=True,
     usual_rates=(0.2, 1000.0),
+    look=_look_at_tilt,
 )

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from rovgraph.diagnosis.check import acoustics
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
 from rovgraph.diagnosis.check.compasses import body_heading
@@ -128,9 +129,13 @@ CHECKS: tuple[Check, ...] = (
     track,
     current,
     places,
+    acoustics.replies,
+    acoustics.ship,
+    acoustics.depths,
+    acoustics.positions,
     plan,
 )
-MOTION_CHECKS = (headings, vertical, track, current)
+MOTION_CHECKS = (headings, vertical, track, current, acoustics.depths, acoustics.positions)
 
 
 def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:

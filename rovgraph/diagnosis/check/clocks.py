@@ -28,6 +28,7 @@ from rovgraph.log.beams import BEAMS
 from rovgraph.log.frozen import FrozenStretch, Runs, false_values, repeats, without
 from rovgraph.log.stamps import few_digits
 from rovgraph.log.streams import GAP_PERIODS
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
@@ -274,6 +275,8 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
         if sensor.name == "imu" and motion_model(config, log.sensors) == "constant_velocity":
             used = "no IMU is used: velocity and attitude are nearly constant between measurements (motion.model)"
             yield Finding(sensor.name, "ok", used)
+        elif sensor.name == "fix" and log.sensors & set(ACOUSTICS):
+            continue
         elif sensor.if_missing is not None and sensor.name not in log:
             yield Finding(sensor.name, *sensor.if_missing, "missing")
     if not heading_sources(config, log.sensors):

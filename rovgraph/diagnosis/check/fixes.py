@@ -70,24 +70,33 @@ class _Line:
 
 
 @dataclass(frozen=True)
-class _Tracks:
+class Tracks:
     """The DVL's track beside the fixes.
 
     Attributes
     ----------
     sensor : compass that turns it
+    heading : its times and headings [rad]
+    arm : of what is positioned, from the DVL, forward and starboard [m]
     pings : with bottom lock
     way, mirrored : ndarray, shape (n,), its track, and that of a DVL whose y axis points the other way [m]
     """
 
     sensor: str
+    heading: tuple[Array, Array]
+    arm: complex
     pings: Stream
-    plane: "_Plane"
+    plane: "Plane"
     way: Complexes
     mirrored: Complexes
 
+    def beside(self, positions: Stream) -> "Plane":
+        """The same track beside other positions."""
+        arms = self.arm * np.exp(1j * np.interp(positions.time, *self.heading))
+        return Plane(positions, self.pings.time, arms)
 
-def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | None:
+
+def tracks(log: Log, config: Config, compass: str | None = None) -> Tracks | None:
     """The DVL's track by the heading that determines it best, or by one compass; None where something is missing."""
     if not {"dvl", "fix"} <= log.sensors:
         return None
@@ -101,21 +110,21 @@ def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | N
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
     arm = complex(*config.fix.lever_arm_m[:2]) - complex(*config.dvl.lever_arm_m[:2])  # from the DVL
-    plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
+    plane = Plane(log["fix"], pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
     way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
-    return _Tracks(sensor, pings, plane, way, mirrored)
+    return Tracks(sensor, psi, arm, pings, plane, way, mirrored)
 
 
 def turned_by(log: Log, config: Config, compass: str) -> float | None:
     """How far the DVL's track by a compass has to be turned to fit the fixes [rad]; None where they do not show it."""
-    found = _tracks(log, config, compass)
+    found = tracks(log, config, compass)
     if found is None or found.plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
         return None
     line = found.plane.fit(found.way, 0.0)
     return None if line.agreement < TRACK.follows else float(np.angle(line.c))
 
 
-def _too_short(found: _Tracks, geodetic: bool) -> Finding:
+def _too_short(found: Tracks, geodetic: bool) -> Finding:
     """Fixes that move too little to be compared, although the DVL moves far."""
     line, moved = found.plane.fit(found.way, 0.0), found.plane.spread_of(found.way)
     if moved < max(ENOUGH_DISTANCE, FARTHER * found.plane.spread):
@@ -130,7 +139,7 @@ def _too_short(found: _Tracks, geodetic: bool) -> Finding:
 
 def track(log: Log, config: Config) -> Iterator[Finding]:
     """Handedness, rotation, scale and clock of the DVL's velocities against the fixes."""
-    found = _tracks(log, config)
+    found = tracks(log, config)
     if found is None:
         return
     sensor, pings, plane, way, mirrored = found.sensor, found.pings, found.plane, found.way, found.mirrored
@@ -187,7 +196,7 @@ def _better(one: _Line, other: _Line, times: float = 1.5) -> bool:
     return one.error + TRACK.evidence < other.error and one.error * times < other.error
 
 
-def _believed(config: Config, compasses: Collection[str]) -> float:
+def heading_believed(config: Config, compasses: Collection[str]) -> float:
     """How far heading and mounting may be off by what is believed of them [rad]."""
     priors = {name: belief for name, belief in beliefs(config).items() if belief.estimate}
     sds = [priors[name].sd for name in ("dvl_yaw", *(OFFSETS[sensor] for sensor in compasses)) if name in priors]
@@ -209,7 +218,7 @@ def _contradicted(as_is: _Line) -> Finding:
 
 def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Line) -> Finding:
     angle, scale = float(np.angle(as_is.c)), float(abs(as_is.c))
-    wrong = abs(angle) > max(MISALIGNED, _believed(config, sources)) + SURE * as_is.sd or (
+    wrong = abs(angle) > max(MISALIGNED, heading_believed(config, sources)) + SURE * as_is.sd or (
         not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
@@ -221,11 +230,10 @@ def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Lin
     return Finding("dvl", "warning" if wrong else "ok", text, "turned")
 
 
-class _Plane:
+class Plane:
     """Fixes as complex numbers, less their arm from the DVL, and the stretches in which the DVL's track is known."""
 
-    def __init__(self, log: Log, pings: Array, arms: Complexes):
-        fix = log["fix"]
+    def __init__(self, fix: Stream, pings: Array, arms: Complexes):
         lost = np.cumsum(np.diff(pings) > LONGEST_GAP)
         self.pings, self.time = pings, fix.time
         stretch = np.concatenate([[0], lost])[np.searchsorted(pings, fix.time).clip(0, len(pings) - 1)]
@@ -246,22 +254,22 @@ class _Plane:
     @property
     def spread(self) -> float:
         """Of the fixes within their stretches [m]."""
-        return 0.0 if self.count < MIN_FIXES else float(2.0 * np.sqrt(np.mean(np.abs(self._free(self.fixes)) ** 2)))
+        return 0.0 if self.count < MIN_FIXES else float(2.0 * np.sqrt(np.mean(np.abs(self.free(self.fixes)) ** 2)))
 
     def spread_of(self, way: Complexes) -> float:
         """The same of a track at the times of the fixes [m]."""
-        return float(2.0 * np.sqrt(np.mean(np.abs(self._free(self._at(way, 0.0))) ** 2)))
+        return float(2.0 * np.sqrt(np.mean(np.abs(self.free(self.at(way, 0.0))) ** 2)))
 
     def way(self, velocity: Complexes) -> Complexes:
         """Integral of a velocity at the pings."""
         steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.minimum(np.diff(self.pings), LONGEST_GAP)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
-    def _at(self, way: Complexes, lag: float) -> Complexes:
+    def at(self, way: Complexes, lag: float) -> Complexes:
         when = self.time - lag
         return np.interp(when, self.pings, way.real) + 1j * np.interp(when, self.pings, way.imag)
 
-    def _free(self, values: Complexes) -> Complexes:
+    def free(self, values: Complexes) -> Complexes:
         """Without the mean of each stretch; shape (count,)."""
         values, stretch = values[self.inside], self.stretch[self.inside]
         n = np.maximum(np.bincount(stretch), 1)
@@ -270,7 +278,7 @@ class _Plane:
 
     def fit(self, way: Complexes, lag: float) -> _Line:
         """Turn and scale of a track that the fixes follow after a lag."""
-        d, D = self._free(self.fixes), self._free(self._at(way, lag))
+        d, D = self.free(self.fixes), self.free(self.at(way, lag))
         square = max(float(np.vdot(D, D).real), 1e-12)
         c = complex(np.vdot(D, d)) / square
         left = d - c * D
@@ -279,7 +287,7 @@ class _Plane:
         total = max(float(np.vdot(d, d).real), 1e-12)
         agreement = float(abs(np.vdot(D, d))) / np.sqrt(square * total)
         error = float(np.vdot(left, left).real)
-        return _Line(c, np.sqrt(error / len(d) * _inflation(left) / square), agreement, error / self.noise**2)
+        return _Line(c, np.sqrt(error / len(d) * inflation(left) / square), agreement, error / self.noise**2)
 
     @property
     def noise(self) -> float:
@@ -291,18 +299,18 @@ class _Plane:
         """How late the fixes are [s], its sd, and how much it explains in chi-square."""
         reach = min(TRACK.reach_s, 0.25 * (self.time[-1] - self.time[0]))
         lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
-        d = self._free(self.fixes)
+        d = self.free(self.fixes)
         error = np.empty(len(lags))
         for k, lag in enumerate(lags):
-            D = self._free(self._at(way, float(lag)))
+            D = self.free(self.at(way, float(lag)))
             error[k] = float(np.vdot(d, d).real) - abs(np.vdot(D, d)) ** 2 / max(float(np.vdot(D, D).real), 1e-12)
         k = int(np.argmin(error))
         if not 0 < k < len(lags) - 1:
             return 0.0, np.inf, 0.0
         bend = (error[k - 1] - 2.0 * error[k] + error[k + 1]) / LAG_STEP**2
-        D = self._free(self._at(way, float(lags[k])))
+        D = self.free(self.at(way, float(lags[k])))
         left = d - complex(np.vdot(D, d)) / max(float(np.vdot(D, D).real), 1e-12) * D
-        variance = max(error[k] / len(d), 1e-9) * _inflation(left)
+        variance = max(error[k] / len(d), 1e-9) * inflation(left)
         seconds = lags[k] + 0.5 * (error[k - 1] - error[k + 1]) / LAG_STEP / max(bend, 1e-12)
         unshifted = error[len(lags) // 2]
         return float(seconds), float(np.sqrt(variance / max(bend, 1e-12))), float((unshifted - error[k]) / variance)
@@ -315,7 +323,7 @@ def _near_median(fixes: Complexes) -> NDArray[np.bool_]:
     return np.asarray(off <= CLIPPED * max(float(np.median(off)), 1e-3))
 
 
-def _inflation(left: Complexes) -> float:
+def inflation(left: Complexes) -> float:
     """How many residuals of a first-order process make one independent one."""
     keep = float(np.real(np.vdot(left[:-1], left[1:]))) / max(float(np.vdot(left, left).real), 1e-12)
     keep = min(max(keep, 0.0), 0.95)
