@@ -215,8 +215,10 @@ class _Solver:
         self.left_out, best = _left_out(batch, self.frozen, self.gaps), self.best
         revealed = [(one.sensor, one.cause) for one in reversed(self.found)]  # first what moves the track most
         seen = self.frozen, self.log, self.gaps, self.left_out, self.findings, revealed, self.before, self.rivals
-        seen = *seen, [("range", mirror.cause, mirror.margin) for mirror in self.mirrors]
-        self.statistics = statistics(Evidence(self.initial, self.estimates, (best or batch).problem, best, *seen))
+        unclear = [("range", mirror.cause, mirror.margin) for mirror in self.mirrors]
+        self.statistics = statistics(
+            Evidence(self.initial, self.estimates, (best or batch).problem, best, *seen, unclear)
+        )
         if best is not None and any(one.kind == "rivals" and one.severity for one in self.statistics):
             self.estimates = [_covering(estimate, [r.p_n for r in self.rivals], best) for estimate in self.estimates]
         if best is not None and self.mirrors:

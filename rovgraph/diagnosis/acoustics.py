@@ -132,7 +132,7 @@ class _LagSearch:
     @staticmethod
     def _fit(r: Array, H: Array) -> tuple[float, Array, Array]:
         """Robust cost of residuals, what is fitted and its sds."""
-        x, weight = np.zeros(H.shape[2]), np.ones(len(r))
+        weight: Array = np.ones(len(r))
         for _ in range(PASSES):
             root = np.sqrt(weight)[:, None]
             A, b = (H * root[..., None]).reshape(-1, H.shape[2]), (r * root).ravel()

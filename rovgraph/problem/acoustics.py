@@ -336,7 +336,7 @@ class Acoustics:
     ) -> Array:
         """Write where the other ends were into contexts; sds that this adds: place [m], heading, tilt [rad]."""
         n, usbl = len(context), self.config.usbl
-        sd = np.zeros((n, 3))
+        sd: Array = np.zeros((n, 3))
         on_ship = np.array([other.beacon < 0 for other in others], bool)
         context[:, at.FRAME : at.FRAME + 9] = np.eye(3).ravel()
         context[:, at.INVERTED] = float(sensor == "usbl" and usbl.head == "vehicle")
@@ -378,7 +378,7 @@ class Acoustics:
             math.radians(ship.heading_sd_deg),
             math.radians(ship.tilt_sd_deg) if tilted or frame != "transducer" else UNKNOWN_TILT_SD,
         )
-        return sd * on_ship[:, None]
+        return np.asarray(sd * on_ship[:, None])
 
     def _unbend(self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other]) -> None:
         """Replace ranges and directions, made with one speed of sound, by those of straight lines, in place."""
