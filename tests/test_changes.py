@@ -10,7 +10,6 @@ from dives import Simulated, altered, batch, changed, falcon, kept, simulated, t
 from rovgraph.diagnosis.check import examine
 from rovgraph.dive import _covering, smooth
 from rovgraph.geometry import rotate, transpose
-from rovgraph.inference.correlated_noise import GaussMarkovError, Rival
 from rovgraph.inference.error_state import replay
 from rovgraph.inference.filter import FilterEngine
 from rovgraph.inference.initialise import initialise
@@ -161,7 +160,7 @@ def test_the_sd_covers_where_rivals_put_the_track(case):
     best = dive.optimum()
     estimate = smoothed(best, dive.initial)
     elsewhere = best.state.p_n + np.array([3.0, -4.0, 0.0])
-    wide = _covering(estimate, [Rival(GaussMarkovError("fix", "fix_error", 1.0, 9.0, 20.0), elsewhere)], best)
+    wide = _covering(estimate, [elsewhere], best)
     more = wide.trajectory.cov_p - estimate.trajectory.cov_p
     np.testing.assert_allclose(more[:, :2, :2], np.broadcast_to([[9.0, -12.0], [-12.0, 16.0]], (len(more), 2, 2)))
     assert not more[:, 2].any() and not more[:, :, 2].any()
