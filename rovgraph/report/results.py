@@ -19,7 +19,7 @@ import pandas as pd
 from rovgraph.diagnosis.alarm import Alarm, verdict_of
 from rovgraph.diagnosis.check.clocks import timing
 from rovgraph.geometry import Array
-from rovgraph.inference.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
+from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, beams_frame
@@ -152,6 +152,7 @@ def _rejected(residuals: pd.DataFrame, stretches: Sequence[Mapping[str, Any]]) -
 
 CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
 BEAMS_FILE = f"{BEAMS}.csv"
+ACOUSTICS_FILE = "acoustics.csv"
 _ORDER = ("smoothed", "filtered", "dead_reckoning")
 
 
@@ -207,6 +208,8 @@ def write_results(
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}{TUM}")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
+    if len(estimates[0].replies):
+        write_csv(estimates[0].replies[REPLY_COLUMNS], folder / ACOUSTICS_FILE, decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
     _write_of_log(folder, estimates[0], log, config, frozen)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
