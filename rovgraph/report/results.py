@@ -27,7 +27,7 @@ from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config
-from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.report.folder import ACOUSTICS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
 
@@ -152,7 +152,6 @@ def _rejected(residuals: pd.DataFrame, stretches: Sequence[Mapping[str, Any]]) -
 
 CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
 BEAMS_FILE = f"{BEAMS}.csv"
-ACOUSTICS_FILE = "acoustics.csv"
 _ORDER = ("smoothed", "filtered", "dead_reckoning")
 
 

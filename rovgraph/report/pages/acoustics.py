@@ -1,7 +1,6 @@
 """Acoustic positioning: replies, the ship and the beacons, for the map, and a section on how well replies fit."""
 
 import html
-import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 
@@ -9,11 +8,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.model.calibration import ACOUSTICS
-from rovgraph.model.config import parse_config
 from rovgraph.report.colours import REJECTED, SERIES, USED
+from rovgraph.report.folder import ACOUSTICS_FILE, beacon_names_of
 from rovgraph.report.pages.page import Item, PageTable, Panel, Section, Trace, line, packed, points, spread
 from rovgraph.report.pages.source import DiveSource
 from rovgraph.report.units import plus_minus, words
@@ -143,26 +141,22 @@ class PageBeacon:
 
 def beacons(source: DiveSource) -> list[PageBeacon]:
     """Those that the configuration names and the dive used, with their places after it."""
-    table, text = source.calibration, source.text("config.yaml") or ""
+    table = source.calibration
     if table is None:
-        return []
-    part = re.search(r"^beacons:.*\n([ #-].*\n)*", text, re.MULTILINE)  # to parse all of it takes as long as the page
-    try:
-        named = parse_config(part[0] if part else "", "config.yaml").beacons
-    except InputError:
         return []
     joint = ((source.summary.get("estimates") or {}).get(source.main.kind) or {}).get("calibration_covariance")
     covariance = pd.DataFrame()
     if isinstance(joint, dict):
         covariance = pd.DataFrame(joint["covariance"], joint["labels"], joint["labels"], dtype=float)
-    found = [PageBeacon(k, str(beacon.name), table, covariance) for k, beacon in enumerate(named)]
+    names = beacon_names_of(source.text("config.yaml") or "")
+    found = [PageBeacon(k, name, table, covariance) for k, name in enumerate(names)]
     return [beacon for beacon in found if np.isfinite(beacon.place).all()]
 
 
 def acoustic_replies(source: DiveSource) -> AcousticReplies | None:
     """Of a dive with an acoustic system; None of others."""
     columns = "time", "sensor", "beacon", "ship_north", "ship_east", "ship_heading", "range", "bearing", "elevation"
-    replies = source.frame("acoustics.csv", *columns, "row")
+    replies = source.frame(ACOUSTICS_FILE, *columns, "row")
     if replies is None or source.residuals is None:
         return None
     replies["beacon"] = replies["beacon"].map(_name)
