@@ -426,8 +426,8 @@ class Navigator:
                 else np.eye(2) * engine.filter.beliefs[place].sd ** 2
             )
             if cov.trace() < BEACON_SD_M**2:
-                sd = np.sqrt(cov.diagonal()).tolist()
-                beacons[k] = BeaconPlace(str(beacon.name), *c[LAYOUT[place]].tolist(), *sd, float(cov[0, 1]))
+                (north, east), sd = c[LAYOUT[place]].tolist(), np.sqrt(cov.diagonal()).tolist()
+                beacons[k] = BeaconPlace(str(beacon.name), north, east, sd[0], sd[1], float(cov[0, 1]))
                 down[k] = float(c[LAYOUT[depth]][0])
         ranges = []
         for heard in acoustics.heard.values():

@@ -78,7 +78,8 @@ class AcousticReplies:
     def measured(self) -> Array:
         """Where a head on the ship puts the vehicle, with its mounting as configured, shape (n, 2)."""
         level = self["range"] * np.cos(self["elevation"])
-        return self.other_end + level[:, None] * np.column_stack([np.cos(self["bearing"]), np.sin(self["bearing"])])
+        towards = np.column_stack([np.cos(self["bearing"]), np.sin(self["bearing"])])
+        return np.asarray(self.other_end + level[:, None] * towards)
 
     @property
     def left_over(self) -> Array:
@@ -97,7 +98,7 @@ class AcousticReplies:
     def direction(self) -> Array:
         """Of the vehicle from the ship's bow, or from north, by the estimate, in [0, 360) [deg]."""
         north, east = (self.estimated - self.other_end).T
-        return np.rad2deg(np.arctan2(east, north) - self.heading) % 360.0
+        return np.asarray(np.rad2deg(np.arctan2(east, north) - self.heading) % 360.0)
 
     def in_axes(self, vector: Array) -> Array:
         """North and east in the ship's axes, forward and starboard, shape (n, 2)."""
