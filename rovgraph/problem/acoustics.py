@@ -413,7 +413,7 @@ class Acoustics:
             math.radians(ship.heading_sd_deg),
             math.radians(ship.tilt_sd_deg) if tilted or frame != "transducer" else UNKNOWN_TILT_SD,
         )
-        return sd * on_ship[:, None]
+        return np.asarray(sd * on_ship[:, None])
 
     def _unbend(self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other]) -> None:
         """Replace ranges and directions, made with one speed of sound, by those of straight lines, in place."""
