@@ -19,7 +19,7 @@ from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.log import Log
 from rovgraph.model.config import Config
 from rovgraph.process import Progress, no_progress
-from rovgraph.report.export import ExportOptions, Track, fixes_of, write_track
+from rovgraph.report.export import ExportOptions, Track, acoustics_of, fixes_of, write_track
 from rovgraph.report.export.track import ESTIMATES as TRACKS
 
 if TYPE_CHECKING:
@@ -171,7 +171,11 @@ class Result:
             raise InputError(f"estimate {estimate!r}: expected {', '.join(TRACKS)}")
         chosen = self.main if estimate is None else self._estimate(estimate)
         name = self.config.name or Path(self.log.source).name
-        return Track(name, chosen.kind, chosen.trajectory, self.log.origin, fixes_of(self.main.residuals))
+        places = {entry.label: (entry.value, entry.sd) for entry in self.main.calibration}
+        beacons = [str(beacon.name) for beacon in self.config.beacons]
+        acoustics = acoustics_of(self.main.replies, places, beacons) if len(self.main.replies) else None
+        fixes = fixes_of(self.main.residuals)
+        return Track(name, chosen.kind, chosen.trajectory, self.log.origin, fixes, acoustics=acoustics)
 
     def save(
         self,

@@ -20,6 +20,7 @@ from rovgraph.inference.estimate import (
     body_trajectory,
     calibration_estimates,
     calibration_history,
+    reply_frame,
     residual_frame,
 )
 from rovgraph.inference.filter import FilterEngine
@@ -39,6 +40,7 @@ from rovgraph.inference.remembered_places import RememberedPlace, columns, commo
 from rovgraph.inference.smoother import optimum
 from rovgraph.kernels.measurement_row import TIME
 from rovgraph.log import Log, Measurement
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -146,7 +148,11 @@ class FilterHistory:
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
         residuals = residual_frame(self._measured(problem, smoothed))
-        return Estimate(kind, trajectory, calibration, history, residuals, self._summary(problem))
+        acoustic = [s for s in problem.used if s in ACOUSTICS]
+        replies = reply_frame(
+            ((s, engine.measurements(problem, problem.of_sensor(s))) for s in acoustic), engine.initial.config
+        )
+        return Estimate(kind, trajectory, calibration, history, residuals, self._summary(problem), replies=replies)
 
     def _measured(self, problem: Problem, smoothed: State | None) -> Iterator[tuple[str, Measurements, State, Array]]:
         """Each sensor's measurements, the states they are compared with, and their weights."""

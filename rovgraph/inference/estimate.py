@@ -10,20 +10,25 @@ from numpy.typing import ArrayLike
 
 from rovgraph.dates import Moments, seconds_of_moments
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, cross, rotate, skew, transpose
+from rovgraph.geometry import Array, cross, rotate, rpy_from_matrix, skew, transpose
 from rovgraph.inference.assumptions import rests_on_doubtful_compass
 from rovgraph.inference.observability import verdict
 from rovgraph.inference.posterior import POSITION, ROTATION, Posterior, displaced_by_heading
 from rovgraph.inference.trajectory import Trajectory
+from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import RATE_B, SPREAD, TIME
-from rovgraph.model.calibration import CONSIDERED, TABLE, Belief
+from rovgraph.model.calibration import CONSIDERED, LAYOUT, TABLE, Belief, beacon_names
+from rovgraph.model.config import Config, mount_matrix
 from rovgraph.model.state import State
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
-from rovgraph.sensors import innovation
+from rovgraph.sensors import AcousticExchange, innovation
 
 RESIDUAL_COLUMNS = [
     "time", "sensor", "component", "measured", "predicted", "innovation", "sd", "normalised", "weight", "row",
+]  # fmt: skip
+REPLY_COLUMNS = [
+    "time", "sensor", "beacon", "ship_north", "ship_east", "ship_heading", "range", "bearing", "elevation", "row",
 ]  # fmt: skip
 
 
@@ -122,6 +127,7 @@ class Estimate:
         innovation / sd, weight is 1 for a full measurement and 0 for a rejected one
     summary : numbers about the solution, ready for JSON
     posterior : of a smoothed estimate of the chain: what `covariance`, `joint`, `relative` and `sample` come from
+    replies : columns `REPLY_COLUMNS`, of each acoustic measurement, as `reply_frame` has them
     """
 
     kind: str
@@ -131,6 +137,7 @@ class Estimate:
     residuals: pd.DataFrame
     summary: dict[str, Any] = field(default_factory=dict)
     posterior: Posterior | None = field(default=None, compare=False)
+    replies: pd.DataFrame = field(default_factory=lambda: reply_frame(()), compare=False)
 
     def __repr__(self) -> str:
         return f"<Estimate, {self.kind}: {self.trajectory!r}>"
@@ -417,3 +424,43 @@ def residual_frame(measured: Iterable[tuple[str, Measurements, State, Array]] = 
     order = np.argsort(np.concatenate(parts["time"]), kind="stable")
     # column by column: of a long dive, sorting frames takes several times its memory
     return pd.DataFrame({name: np.concatenate(parts.pop(name))[order] for name in [*parts]})
+
+
+def reply_frame(measured: Iterable[tuple[str, Measurements]], config: Config | None = None) -> pd.DataFrame:
+    """What each acoustic measurement says, and where the ship was, in order of time.
+
+    ``beacon`` is the name of the other end, empty where that is the ship, whose place (that of its head or receiver)
+    and heading then stand beside it. ``bearing`` (from north) and ``elevation`` (positive downwards) are those that a
+    head on the ship measured, with its mounting as configured, level. Unknown numbers are NaN; m and rad.
+
+    Parameters
+    ----------
+    measured : sensor and its n measurements; those of other sensors are passed over
+    config : effective configuration
+    """
+    parts = []
+    for sensor, block in measured:
+        if config is None or not isinstance(block.model, AcousticExchange) or not len(block):
+            continue
+        x, usbl = block.model.context, config.usbl
+        of_beacon, R_nf = x[:, at.BEACON_AT] >= 0.0, x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3)
+        names = {LAYOUT[beacon_names(k)[0]].start: str(beacon.name) for k, beacon in enumerate(config.beacons)}
+        by_head = sensor == "usbl" and usbl.head == "ship"
+        u_n = rotate(R_nf @ mount_matrix(usbl.mount_rpy_deg), x[:, at.SEEN : at.SEEN + 3])
+        heading = np.full(len(x), np.nan) if by_head and usbl.frame == "north" else rpy_from_matrix(R_nf)[:, 2]
+        columns = {
+            "time": block.time,
+            "sensor": np.full(len(block), sensor, object),
+            "beacon": np.array([names.get(int(place), "") for place in x[:, at.BEACON_AT]], object),
+            "ship_north": np.where(of_beacon, np.nan, x[:, at.HEARD]),
+            "ship_east": np.where(of_beacon, np.nan, x[:, at.HEARD + 1]),
+            "ship_heading": np.where(of_beacon, np.nan, heading),
+            "range": block.z[:, 0],
+            "bearing": np.where(by_head, np.arctan2(u_n[:, 1], u_n[:, 0]), np.nan),
+            "elevation": np.where(by_head, np.arcsin(np.clip(u_n[:, 2], -1.0, 1.0)), np.nan),
+            "row": block.line,
+        }
+        parts.append(pd.DataFrame(columns))
+    if not parts:
+        return pd.DataFrame(columns=pd.Index(REPLY_COLUMNS))
+    return pd.concat(parts, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)

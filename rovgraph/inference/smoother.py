@@ -19,6 +19,7 @@ from rovgraph.inference.estimate import (
     body_trajectory,
     calibration_estimates,
     calibration_history,
+    reply_frame,
     residual_frame,
 )
 from rovgraph.inference.faulty_intervals import CLEAR, Searches
@@ -252,6 +253,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "considered": [name for name in best.unknowns.considered if name not in held],
         },
         Posterior.of(best, b) if isinstance(best, ChainOptimum) else None,
+        reply_frame(best.blocks.items(), b.config),
     )
 
 

@@ -23,9 +23,9 @@ from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late,
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
-from rovgraph.live.solution import Event, Solution
+from rovgraph.live.solution import BeaconPlace, Event, RangeCircle, ShipPose, Solution
 from rovgraph.log import Log, Measurement
-from rovgraph.model.calibration import LAYOUT, TABLE
+from rovgraph.model.calibration import LAYOUT, TABLE, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from rovgraph.inference.graph.isam2 import IncrementalEstimator
 
 ALTITUDE_S = 3.0  # longest age of an altitude
+RANGE_S = 15.0  # longest age of an acoustic range that is shown
+BEACON_SD_M = 100.0  # beyond it a beacon is not shown
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 UNEXPECTED = "began after the first seconds, and is not used"
@@ -229,6 +231,7 @@ class Navigator:
             predicted_s=float(t.time[0]) - engine.snapshots[-1].time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
+            **self._acoustics(engine, known, t.p_n[0]),
         )
 
     def state(self) -> dict[str, Any] | None:
@@ -406,6 +409,42 @@ class Navigator:
             label: (value, value_sd)
             for name in engine.filter.unknowns.estimated
             for label, value, value_sd in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
+        }
+
+    def _acoustics(self, engine: FixedLag, known: Gaussian, p_n: Array) -> dict[str, Any]:
+        """Ship, beacons and the newest ranges, for the page."""
+        acoustics, columns = engine.assembly.acoustics, engine.filter.layout.columns
+        if not acoustics.instruments:
+            return {}
+        c, P = known.c, known.covariance
+        beacons, down = {}, {}
+        for k, beacon in enumerate(self.config.beacons):
+            place, depth = beacon_names(k)
+            cov = (
+                P[columns[place], columns[place]]
+                if place in columns
+                else np.eye(2) * engine.filter.beliefs[place].sd ** 2
+            )
+            if cov.trace() < BEACON_SD_M**2:
+                (north, east), sd = c[LAYOUT[place]].tolist(), np.sqrt(cov.diagonal()).tolist()
+                beacons[k] = BeaconPlace(str(beacon.name), north, east, sd[0], sd[1], float(cov[0, 1]))
+                down[k] = float(c[LAYOUT[depth]][0])
+        ranges = []
+        for heard in acoustics.heard.values():
+            if self.time - heard.time > RANGE_S or (heard.beacon >= 0 and heard.beacon not in beacons):
+                continue
+            north, east, depth_m = heard.place
+            if heard.beacon >= 0:
+                north, east, depth_m = beacons[heard.beacon].north, beacons[heard.beacon].east, down[heard.beacon]
+            level = heard.length**2 - (float(p_n[2]) - depth_m) ** 2
+            if level > 0.0:
+                name = beacons[heard.beacon].name if heard.beacon >= 0 else ""
+                ranges.append(RangeCircle(name, north, east, math.sqrt(level)))
+        ship = acoustics.ship()
+        return {
+            "ship": None if ship is None else ShipPose(*ship),
+            "beacons": tuple(beacons.values()),
+            "ranges": tuple(ranges),
         }
 
     def _travelled(self, p_n: Array, sd: Array) -> float:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from rovgraph.diagnosis.alarm import Alarm, Verdict
 from rovgraph.geometry import Array
@@ -50,6 +51,34 @@ class SensorHealth:
     failed_s: float = 0.0
 
 
+class ShipPose(NamedTuple):
+    """The ship that carries an acoustic system: north and east of its antenna [m], heading [rad], NaN = not known."""
+
+    north: float
+    east: float
+    heading: float
+
+
+class BeaconPlace(NamedTuple):
+    """An acoustic beacon, where the estimate has it [m, m^2]."""
+
+    name: str
+    north: float
+    east: float
+    north_sd: float
+    east_sd: float
+    cov_north_east: float
+
+
+class RangeCircle(NamedTuple):
+    """Where a range puts the vehicle, at its depth: about a beacon, or about the ship, which has no name [m]."""
+
+    name: str
+    north: float
+    east: float
+    radius: float
+
+
 @dataclass(frozen=True)
 class Solution:
     """The navigation solution of one moment, of the body's origin.
@@ -71,6 +100,7 @@ class Solution:
     predicted_s : time since the newest keyframe, bridged by the IMU alone [s]
     latency_s : from the arrival of the newest measurement to this solution [s], None in a replay
     update_s : duration of the newest update [s]
+    ship, beacons, ranges : of an acoustic system: the ship, beacons whose place is known, the newest ranges
     """
 
     time: float
@@ -93,3 +123,6 @@ class Solution:
     predicted_s: float = 0.0
     latency_s: float | None = None
     update_s: float = 0.0
+    ship: ShipPose | None = None
+    beacons: tuple[BeaconPlace, ...] = ()
+    ranges: tuple[RangeCircle, ...] = ()

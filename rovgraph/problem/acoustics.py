@@ -53,6 +53,23 @@ class Pose(NamedTuple):
     rates: Array
 
 
+class Heard(NamedTuple):
+    """The newest range to another end, online.
+
+    Attributes
+    ----------
+    time : [s]
+    beacon : its place in ``beacons``, -1 = the ship
+    place : where the ship's head or receiver was, north, east and down [m]
+    length : one way [m]
+    """
+
+    time: float
+    beacon: int
+    place: tuple[float, float, float]
+    length: float
+
+
 class Track:
     """Values of a stream of the ship that grows, interpolated."""
 
@@ -69,6 +86,11 @@ class Track:
     def known(self) -> bool:
         """Whether anything is known."""
         return self.held is not None or len(self.time) > 0
+
+    @property
+    def newest(self) -> Array | None:
+        """The last values, shape (width,); None without any."""
+        return self.held if self.held is not None or not len(self.time) else self.values[-1]
 
     def take(self, time: Array, values: Array) -> None:
         """Add values in the order of time, or one that is late."""
@@ -117,6 +139,10 @@ class Acoustics:
     ----------
     config : effective configuration
     instruments : the sensors in use
+
+    Attributes
+    ----------
+    heard : the newest range of each other end, by its place in ``beacons``, online
     """
 
     def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
@@ -129,6 +155,7 @@ class Acoustics:
         if ship.heading_deg is not None:
             self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
+        self.heard: dict[int, Heard] = {}
         self._transponder: float | None = None  # that has answered
         self.since: dict[str, float] = {}  # sensor -> time of its first exchange, from which a clock drifts [s]
         self._profile = profile_of(config.sound.profile)
@@ -166,6 +193,7 @@ class Acoustics:
             time, row = (np.array([getattr(one, name) for one in some]) for name in ("time", "row"))
             raw = Stream(some[0].sensor, (), time, np.array([one.values for one in some]), row)
             made = self.exchanges(raw, late[raw.sensor], left_out)
+            self._hear(made)
             rows = zip(made.time.tolist(), made.data, made.row.tolist(), strict=True)
             out += [Measurement(t, raw.sensor, values, line) for t, values, line in rows]
         return out
@@ -175,6 +203,23 @@ class Acoustics:
         if sensor == "range":
             return TOGETHER_S if self._receivers else -math.inf
         return 0.0 if self.config.usbl.head == "ship" or not self._places else -math.inf
+
+    def _hear(self, stream: Stream) -> None:
+        """Keep the newest range of each other end."""
+        skipped = 2 * self.instruments[stream.sensor].model.dim
+        ends = {LAYOUT[beacon_names(k)[0]].start: k for k in self._places.values()}
+        for time, values in zip(stream.time.tolist(), stream.data.tolist(), strict=True):
+            context = values[skipped:]
+            north, east, down = context[at.HEARD : at.HEARD + 3]
+            beacon = ends.get(int(context[at.BEACON_AT]), -1)
+            self.heard = {**self.heard, beacon: Heard(time, beacon, (north, east, down), values[0])}
+
+    def ship(self) -> tuple[float, float, float] | None:
+        """North and east of the ship [m] and its heading [rad], NaN without one, as newest known; None = not known."""
+        place, heading = self.tracks["ship"].newest, self.tracks["ship_heading"].newest
+        if place is None:
+            return None
+        return float(place[0]), float(place[1]), math.nan if heading is None else float(heading[0])
 
     def _known_until(self) -> float:
         """Up to when all is known of the ship that it has told of so far."""

@@ -235,6 +235,11 @@ class Assembly:
             self._due = -math.inf
 
     @property
+    def acoustics(self) -> Acoustics:
+        """What is known of the ship, and of acoustic replies."""
+        return self._acoustics
+
+    @property
     def span(self) -> tuple[float, float]:
         """Times of the first and of the newest sample [s]."""
         return float(self._table[0, 0]) if len(self._table) else math.nan, self.newest

@@ -9,6 +9,7 @@ import errno
 import json
 import os
 import platform
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
@@ -19,12 +20,23 @@ from rovgraph import compatibility
 from rovgraph._version import __version__
 from rovgraph.errors import InputError, warn
 
-SUMMARY = "summary.json"
+SUMMARY, ACOUSTICS_FILE = "summary.json", "acoustics.csv"
 STAMP = {  # in every summary: the folder is ours
     "program": "rovgraph",
     "version": __version__,
     "format": compatibility.RESULTS,
 }
+
+
+def beacon_names_of(config: str) -> list[str]:
+    """Names of the acoustic beacons of a config.yaml, in the order of their variables; none if it is bad."""
+    from rovgraph.model.config import parse_config
+
+    part = re.search(r"^beacons:.*\n([ #-].*\n)*", config, re.MULTILINE)  # to parse all of it takes long
+    try:
+        return [str(beacon.name) for beacon in parse_config(part[0], "config.yaml").beacons] if part else []
+    except InputError:
+        return []
 
 
 def check_writable(path: Path, force: bool, inputs: Sequence[Path | None] = ()) -> None:

@@ -19,7 +19,7 @@ import pandas as pd
 from rovgraph.diagnosis.alarm import Alarm, verdict_of
 from rovgraph.diagnosis.check.clocks import timing
 from rovgraph.geometry import Array
-from rovgraph.inference.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
+from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, beams_frame
@@ -27,7 +27,7 @@ from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config
-from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.report.folder import ACOUSTICS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
 
@@ -207,6 +207,8 @@ def write_results(
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}{TUM}")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
+    if len(estimates[0].replies):
+        write_csv(estimates[0].replies[REPLY_COLUMNS], folder / ACOUSTICS_FILE, decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
     _write_of_log(folder, estimates[0], log, config, frozen)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")

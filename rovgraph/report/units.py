@@ -69,7 +69,7 @@ def duration(seconds: float | None) -> str:
 
 
 WORDS = {"acc": "accelerometer", "gyr": "gyro", "mag": "magnetometer", "ahrs": "AHRS", "dvl": "DVL", "imu": "IMU",
-         "sin": "sine part", "cos": "cosine part"}  # fmt: skip
+         "usbl": "USBL",          "sin": "sine part", "cos": "cosine part"}  # fmt: skip
 PARTS = {"x", "y", "z", "sin", "cos", "xx", "yy", "zz", "xy", "xz", "yz"}
 
 

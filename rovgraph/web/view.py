@@ -15,7 +15,7 @@ import numpy as np
 
 from rovgraph.live.marks import Marks
 from rovgraph.live.outputs.json_lines import as_dict
-from rovgraph.live.solution import Solution
+from rovgraph.live.solution import BeaconPlace, RangeCircle, ShipPose, Solution
 from rovgraph.log.units import shown
 from rovgraph.model.calibration import TABLE
 from rovgraph.sensors.instruments import HEADING_STREAMS
@@ -186,6 +186,9 @@ class View:
             "alarms": [{"kind": a.kind, "sensor": a.sensor, "severity": a.severity, "text": a.text} for a in s.alarms],
             "limits": self._beyond(s),
             "marks": [asdict(mark) for mark in self.marks.all],
+            "ship": None if s.ship is None else _plain(s.ship),
+            "beacons": [_plain(beacon) for beacon in s.beacons],
+            "ranges": [_plain(circle) for circle in s.ranges],
         }
 
     def update(self, cursor: Cursor) -> str | None:
@@ -234,6 +237,12 @@ def _degrees(points: list[Any], at: Solution) -> list[list[float]]:
     latitude, longitude, _ = pymap3d.ned2geodetic(north - n, east - e, 0.0, at.latitude, at.longitude, 0.0)
     degrees: list[list[float]] = np.column_stack([np.round(longitude, 8), np.round(latitude, 8), -down]).tolist()
     return degrees
+
+
+def _plain(values: ShipPose | BeaconPlace | RangeCircle) -> dict[str, Any]:
+    """By name, null for what is not known."""
+    known = values._asdict()
+    return {name: _rounded(value) if isinstance(value, float) else value for name, value in known.items()}
 
 
 def _rounded(value: float) -> float | None:

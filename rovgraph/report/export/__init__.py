@@ -13,14 +13,16 @@ from rovgraph.report.export.formats import (
     write_track,
 )
 from rovgraph.report.export.tagging import Tagged, tag
-from rovgraph.report.export.track import Fixes, Track, fixes_of, read_track
+from rovgraph.report.export.track import Acoustics, Fixes, Track, acoustics_of, fixes_of, read_track
 
 __all__ = [
+    "Acoustics",
     "ExportFormat",
     "ExportOptions",
     "Fixes",
     "Tagged",
     "Track",
+    "acoustics_of",
     "check_exportable",
     "export_formats",
     "fixes_of",

@@ -30,9 +30,9 @@ Feature = dict[str, Any]
 
 
 def write_geojson(track: Track, path: Path, options: ExportOptions) -> None:
-    """A feature collection; ``kind`` of each feature is track, point, ellipse or fix."""
+    """A feature collection; ``kind`` of each feature is track, point, ellipse, fix, ship or beacon."""
     points = track.at_rate(options.rate_or(SHOWN_HZ))
-    features = [_line(track), *_points(points), *_ellipses(points), *_fixes(track)]
+    features = [_line(track), *_points(points), *_ellipses(points), *_fixes(track), *_acoustics(track)]
     collection = {"type": "FeatureCollection", "name": track.name, "features": features}
     path.write_text(json.dumps(collection, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
 
@@ -66,9 +66,25 @@ def _fixes(track: Track) -> Iterator[Feature]:
         yield _feature("Point", place, kind="fix", time=round(float(time), 4), used=bool(used))
 
 
+def _acoustics(track: Track) -> Iterator[Feature]:
+    if track.acoustics is None:
+        return
+    if len(ship := track.acoustics.ship) > 1:
+        yield _feature("LineString", _places(track, ship), kind="ship")
+    for name, (north, east, north_sd, east_sd) in track.acoustics.beacons.items():
+        sds = {"north_sd": round(north_sd, 4), "east_sd": round(east_sd, 4)}
+        yield _feature("Point", _places(track, np.array([[north, east]]))[0], kind="beacon", name=name, **sds)
+
+
+def _places(track: Track, places: Array) -> list[list[float]]:
+    """Longitude and latitude of places, shape (n, 2)."""
+    lat, lon = track.place(*places.T)
+    found: list[list[float]] = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
+    return found
+
+
 def _ring(track: Track, corners: Array) -> list[list[float]]:
-    lat, lon = track.place(*corners[:-1].T)
-    ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
+    ring = _places(track, corners[:-1])
     return [*ring, ring[0]]
 
 
@@ -88,7 +104,7 @@ _GEOJSON = (ExportFormat("geojson", "GeoJSON", ".geojson", write_geojson, needs_
 
 
 KML_ELLIPSES = 60  # along a track
-LINE, USED, REJECTED, SHADE = "ff00a5ff", "ff00c000", "ff0000ff", "4000a5ff"  # aabbggrr
+LINE, USED, REJECTED, SHADE, SHIP = "ff00a5ff", "ff00c000", "ff0000ff", "4000a5ff", "ff808080"  # aabbggrr
 
 
 def document(track: Track, options: ExportOptions) -> "simplekml.Kml":
@@ -111,6 +127,7 @@ def document(track: Track, options: ExportOptions) -> "simplekml.Kml":
     line.style.linestyle.color, line.style.linestyle.width = LINE, 3
     _add_ellipses(kml, sampled)
     _add_fixes(kml, track)
+    _add_acoustics(kml, track)
     return kml
 
 
@@ -119,8 +136,7 @@ def _add_ellipses(kml: "simplekml.Kml", track: Track) -> None:
     for k in np.unique(np.linspace(0, len(t) - 1, KML_ELLIPSES).astype(int)):
         if not np.isfinite(P := t.cov_p[k, :2, :2]).all():
             continue
-        lat, lon = track.place(*(t.p_n[k, :2] + ellipse(P)).T)
-        ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
+        ring = _places(track, t.p_n[k, :2] + ellipse(P))
         polygon = folder.newpolygon(name=f"{t.time[k] - t.time[0]:.0f} s", outerboundaryis=ring)
         polygon.style.polystyle.color, polygon.style.linestyle.width = SHADE, 0
 
@@ -136,6 +152,17 @@ def _add_fixes(kml: "simplekml.Kml", track: Track) -> None:
         point.description = f"{time - start:.1f} s, {'used' if used else 'rejected'}"
         point.style.iconstyle.color = USED if used else REJECTED
         point.style.iconstyle.scale = 0.4
+
+
+def _add_acoustics(kml: "simplekml.Kml", track: Track) -> None:
+    if track.acoustics is None:
+        return
+    if len(ship := track.acoustics.ship) > 1:
+        line = kml.newlinestring(name="ship", coords=_places(track, ship))
+        line.style.linestyle.color, line.style.linestyle.width = SHIP, 2
+    for name, (north, east, north_sd, east_sd) in track.acoustics.beacons.items():
+        point = kml.newpoint(name=name, coords=_places(track, np.array([[north, east]])))
+        point.description = f"beacon, sd north {north_sd:.2g} m, east {east_sd:.2g} m"
 
 
 def write_kml(track: Track, path: Path, options: ExportOptions) -> None:

@@ -1,6 +1,7 @@
 """The data of an export: a trajectory with its place on Earth, its time and its fixes, as a table of points."""
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.trajectory import Trajectory, read_trajectory
+from rovgraph.report.folder import ACOUSTICS_FILE, beacon_names_of
 
 CHI2_95 = 5.991  # of two degrees of freedom
 ESTIMATES = ("smoothed", "filtered", "dead_reckoning")
@@ -36,6 +38,20 @@ class Fixes:
 
 
 @dataclass(frozen=True)
+class Acoustics:
+    """What carried an acoustic system.
+
+    Attributes
+    ----------
+    ship : ndarray, shape (n, 2), north and east of its head when it heard replies [m]
+    beacons : name -> north, east and their sds [m]
+    """
+
+    ship: Array
+    beacons: Mapping[str, tuple[float, float, float, float]]
+
+
+@dataclass(frozen=True)
 class Track:
     """An estimate of a dive, ready to be written.
 
@@ -47,6 +63,7 @@ class Track:
     origin : latitude and longitude [deg] of north = east = 0; None = not known
     fixes : None where the dive has none
     surface : height of the water's surface above sea level [m]
+    acoustics : None where the dive has no acoustic system
     """
 
     name: str
@@ -55,6 +72,7 @@ class Track:
     origin: tuple[float, float] | None = None
     fixes: Fixes | None = None
     surface: float = 0.0
+    acoustics: Acoustics | None = None
 
     @cached_property
     def lat_lon(self) -> tuple[Array, Array]:
@@ -230,7 +248,8 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
     place = summary.get("origin")
     origin = None if place is None else (float(place["lat_deg"]), float(place["lon_deg"]))
     trajectory = read_trajectory(folder / f"trajectory_{chosen}.csv")
-    return Track(str(summary.get("name") or folder.name), chosen, trajectory, origin, _read_fixes(folder))
+    name = str(summary.get("name") or folder.name)
+    return Track(name, chosen, trajectory, origin, _read_fixes(folder), acoustics=_read_acoustics(folder, summary))
 
 
 def _read_fixes(folder: Path) -> Fixes | None:
@@ -239,6 +258,35 @@ def _read_fixes(folder: Path) -> Fixes | None:
         return None
     columns = ["time", "sensor", "component", "measured", "weight"]
     return fixes_of(pd.read_csv(path, usecols=columns))
+
+
+def _read_acoustics(folder: Path, summary: Mapping[str, object]) -> Acoustics | None:
+    if not (folder / ACOUSTICS_FILE).is_file():
+        return None
+    table = pd.read_csv(folder / "calibration.csv")
+    table = table[table["estimate"] == summary.get("main_estimate")]
+    places = {str(label): (value, sd) for label, value, sd in table[["label", "value", "sd"]].itertuples(index=False)}
+    names = beacon_names_of((folder / "config.yaml").read_text(encoding="utf-8"))
+    return acoustics_of(pd.read_csv(folder / ACOUSTICS_FILE), places, names)
+
+
+def acoustics_of(
+    replies: pd.DataFrame, calibration: Mapping[str, tuple[float, float]], names: Sequence[str]
+) -> Acoustics | None:
+    """Ship and beacons among replies (docs/results.md), None without any.
+
+    Parameters
+    ----------
+    calibration : label -> value and sd
+    names : of the beacons, in the configuration's order
+    """
+    ship = replies[["ship_north", "ship_east"]].dropna().to_numpy(float)
+    beacons = {}
+    for k, name in enumerate(names):
+        north, east = (calibration.get(f"beacon_{k + 1}_{axis}") for axis in ("north", "east"))
+        if north is not None and east is not None:
+            beacons[name] = (float(north[0]), float(east[0]), float(north[1]), float(east[1]))
+    return Acoustics(ship, beacons) if len(ship) or beacons else None
 
 
 def fixes_of(residuals: pd.DataFrame) -> Fixes | None:

@@ -69,7 +69,7 @@ class Panel:
     title : what is shown
     x, y : names of the axes with their units; of a panel over time, ``x`` is that of the page's clock
     traces : lines, points and bars
-    kind : "time", "map" (equal scales, the cursor is the vehicle) or "xy"
+    kind : "time", "map" (equal scales, the cursor is the vehicle), "plan" (equal scales) or "xy"
     note : how to read it
     levels : horizontal lines that a reader compares with [unit of y]
     spans : from, to, colour: times that are shaded

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rovgraph.errors import InputError
+from rovgraph.report.pages.acoustics import acoustics_sections
 from rovgraph.report.pages.calibration import calibration_section
 from rovgraph.report.pages.dive import dive_section
 from rovgraph.report.pages.page import render, write
@@ -25,6 +26,7 @@ def dive_page(source: DiveSource) -> str:
         verdict_section(source),
         separation_section(source),
         dvl_section(source),
+        *acoustics_sections(source),
         residuals_section(source),
         compass_section(source),
         clocks_section(source),

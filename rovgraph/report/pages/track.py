@@ -11,6 +11,7 @@ from pymap3d.rcurve import meridian, transverse
 
 from rovgraph.geometry import Array
 from rovgraph.report.colours import ESTIMATES, REJECTED, USED
+from rovgraph.report.pages.acoustics import acoustic_traces
 from rovgraph.report.pages.page import Missing, Panel, Trace, extremes, line, packed, points, spread
 from rovgraph.report.pages.source import KINDS, DiveSource, PageTrack
 
@@ -31,6 +32,7 @@ def track_chart(source: DiveSource) -> Panel | Missing:
         *_lines(source, without=source.main.kind if coloured else ""),
         *_ellipses(source.main),
         *_fixes(source.residuals, source),
+        *acoustic_traces(source),
         *_silent(source),
         *coloured,
         *_ends(source),

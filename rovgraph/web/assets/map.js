@@ -98,7 +98,8 @@ export class LiveMap {
   }
 
   fit() {
-    const places = [...(this.state?.marks ?? []).map((m) => [m.north, m.east])];
+    const around = [...(this.state?.marks ?? []), ...(this.state?.beacons ?? []), this.state?.ship].filter(Boolean);
+    const places = around.map((m) => [m.north, m.east]);
     for (let k = 0; k < this.track.length; k += 1) places.push([this.track.north[k], this.track.east[k]]);
     if (!places.length) return;
     const low = [Infinity, Infinity];
@@ -163,6 +164,9 @@ export class LiveMap {
     this.track.draw(c, (n, e) => this.toScreen(n, e));
     if (this.track.length) this.drawHome();
     for (const mark of this.state?.marks ?? []) this.drawMark(mark);
+    for (const range of this.state?.ranges ?? []) this.drawRange(range);
+    for (const beacon of this.state?.beacons ?? []) this.drawBeacon(beacon);
+    if (this.state?.ship) this.drawShip(this.state.ship);
     if (this.state) this.drawVehicle(this.state);
     this.drawNumbers();
     this.drawNorth();
@@ -291,33 +295,69 @@ export class LiveMap {
     c.fillText(text, x + 4, y - 2);
   }
 
-  drawVehicle(s) {
+  drawEllipse(s) {
     const c = this.context;
     const [x, y] = this.toScreen(s.north, s.east);
     const { longer, shorter, angle } = ellipse(s);
-    if (longer * this.scale < 1e6) {
-      c.beginPath();
-      c.ellipse(x, y, longer * this.scale, shorter * this.scale, angle - this.turn - Math.PI / 2, 0, 2 * Math.PI);
-      c.globalAlpha = 0.18;
-      c.fillStyle = palette.sure;
-      c.fill();
-      c.globalAlpha = 1;
-      c.strokeStyle = palette.sure;
-      c.lineWidth = 2;
-      c.stroke();
-    }
+    if (!(longer * this.scale < 1e6)) return;
+    c.beginPath();
+    c.ellipse(x, y, longer * this.scale, shorter * this.scale, angle - this.turn - Math.PI / 2, 0, 2 * Math.PI);
+    c.globalAlpha = 0.18;
+    c.fillStyle = palette.sure;
+    c.fill();
+    c.globalAlpha = 1;
+    c.strokeStyle = palette.sure;
+    c.lineWidth = 2;
+    c.stroke();
+  }
+
+  // Where an acoustic range puts the vehicle.
+  drawRange(range) {
+    const c = this.context;
+    c.beginPath();
+    c.arc(...this.toScreen(range.north, range.east), range.radius * this.scale, 0, 2 * Math.PI);
+    c.setLineDash([3, 5]);
+    c.strokeStyle = palette.soft;
+    c.lineWidth = 1.5;
+    c.stroke();
+    c.setLineDash([]);
+  }
+
+  drawBeacon(beacon) {
+    this.drawEllipse(beacon);
+    const [x, y] = this.toScreen(beacon.north, beacon.east);
+    this.drawSign([[0, -8], [8, 0], [0, 8], [-8, 0]], x, y, 0, palette.paper, palette.ink);
+    this.drawText(beacon.name, x + 6, y - 6, palette.ink);
+  }
+
+  // A hull that points where the ship heads; a square where that is not known.
+  drawShip(ship) {
+    const [x, y] = this.toScreen(ship.north, ship.east);
+    const hull = [[0, -20], [8, -8], [8, 18], [-8, 18], [-8, -8]];
+    const known = ship.heading !== null;
+    this.drawSign(known ? hull : [[-8, -8], [8, -8], [8, 8], [-8, 8]], x, y, known ? ship.heading - this.turn : 0, palette.soft, palette.paper);
+  }
+
+  drawSign(corners, x, y, angle, fill, edge) {
+    const c = this.context;
     c.save();
     c.translate(x, y);
-    c.rotate(s.yaw - this.turn);
+    c.rotate(angle);
     c.beginPath();
-    for (const [px, py] of [[0, -18], [10, 12], [0, 6], [-10, 12]]) c.lineTo(px, py);
+    for (const [px, py] of corners) c.lineTo(px, py);
     c.closePath();
-    c.fillStyle = palette.ink;
+    c.fillStyle = fill;
     c.fill();
-    c.strokeStyle = palette.paper;
+    c.strokeStyle = edge;
     c.lineWidth = 2;
     c.stroke();
     c.restore();
+  }
+
+  drawVehicle(s) {
+    const [x, y] = this.toScreen(s.north, s.east);
+    this.drawEllipse(s);
+    this.drawSign([[0, -18], [10, 12], [0, 6], [-10, 12]], x, y, s.yaw - this.turn, palette.ink, palette.paper);
   }
 
   drawNorth() {

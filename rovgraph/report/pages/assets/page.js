@@ -79,7 +79,7 @@
     const layout = {
       margin: { l: narrow() ? 46 : 60, r: 12, t: 6, b: 44 }, dragmode: narrow() ? false : "zoom", font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
       xaxis: axis(panel.x, panel.log.includes("x"), 12), yaxis: axis(panel.y, panel.log.includes("y"), panel.kind === "map" ? 12 : 6),
-      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.filter((t) => t.name && t.showlegend !== false).length > (panel.kind === "time" || panel.kind === "xy" ? 1 : 0),
+      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.filter((t) => t.name && t.showlegend !== false).length > (panel.kind === "map" ? 0 : 1),
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
@@ -92,8 +92,8 @@
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
     if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
       range: [panel.names.length + 0.7, 0.3] });
+    if (panel.kind === "map" || panel.kind === "plan") Object.assign(layout.yaxis, { scaleanchor: "x", scaleratio: 1 });
     if (panel.kind === "map") {
-      Object.assign(layout.yaxis, { scaleanchor: "x", scaleratio: 1 });
       if (narrow()) { Object.assign(layout, { showlegend: false }); layout.xaxis.nticks = 5; layout.yaxis.nticks = 6; }
       if (data.origin && !narrow()) graticule(layout, null);
     }
