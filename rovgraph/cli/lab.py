@@ -20,7 +20,8 @@ def simulate(
         str,
         typer.Argument(
             help="driven by thrusters: vattern, docking, excited, tank, stationary; "
-            "prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral",
+            "prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral; "
+            "around a beacon: hold, spin, cardinal, box, round",
             show_default=False,
         ),
     ],
@@ -46,6 +47,14 @@ def simulate(
         bool | None,
         typer.Option(
             "--disturbances/--no-disturbances", help="iron on the seabed; default: in a lake", show_default=False
+        ),
+    ] = None,
+    depth: Annotated[float | None, typer.Option(help="depth at the start in m; default: the scenario's")] = None,
+    ship: Annotated[
+        str | None,
+        typer.Option(
+            help="what the ship does of an acoustic system: spin, cardinal, box or round; default: it stays above",
+            show_default=False,
         ),
     ] = None,
     outliers: Annotated[float, typer.Option(help="share of DVL pings that are wrong, 0 to 1")] = 0.0,
@@ -81,6 +90,8 @@ def simulate(
         variant=variant,
         current=current,
         disturbances=disturbances,
+        depth=depth,
+        ship=ship,
         outliers=outliers,
         dropouts=tuple(_pair(text) for text in dropout or ()),
         places=tuple(_pair(text) for text in place or ()),
