@@ -198,7 +198,7 @@ class AcousticSampler:
         columns = SENSORS[sensor].column_names
         values = np.full((len(stamps), len(columns)), np.nan)
         values[:, columns.index(label)] = [math.nan if name is None else label_number(str(name)) for name in who]
-        kept = self._measure(Stream(sensor, columns, stamps, values, np.arange(len(stamps))))
+        kept = self._measure(Stream(sensor, columns, np.asarray(stamps, float), values, np.arange(len(stamps))))
         measured = ["usbl_range", "usbl_bearing", "usbl_elevation"] if sensor == "usbl" else ["range"]
         out = pd.DataFrame(values, columns=pd.Index(columns))[measured]
         out.insert(0, "time", stamps)
@@ -225,7 +225,7 @@ class AcousticSampler:
         return np.sort(found.row)
 
 
-def _move(data: Array, rows: Array, change: Array) -> None:
+def _move(data: Array, rows: NDArray[np.int64], change: Array) -> None:
     """Change ranges [m], and directions across and up [rad], in place; ``change`` has shape (k, 1) or (k, 3)."""
     data[rows, 0] += change[:, 0]
     if change.shape[1] == 1:
