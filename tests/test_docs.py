@@ -42,6 +42,7 @@ SHORTER = {  # the same work on fewer and shorter dives
     "--scenario vattern --seeds 30": "--scenario circle --seeds 1 --duration 40 --estimators dead-reckoning --jobs 1",
     "--from 600": "--from 10",
     "dvl.jsonl --out log.csv": "dvl.jsonl --out log.csv --force",  # each page's folder has a log
+    "plan --config configs/": "plan --manoeuvres ship-spin --duration 60 --imu-rate 25 --config configs/",
     "plan --config dive1.yaml": "plan --manoeuvres straight --config dive1.yaml",
     "plan --config vehicle.yaml --known": "plan --manoeuvres straight --config vehicle.yaml --known",
     "compare log.csv": "compare log.csv --estimators dead-reckoning --jobs 1",
@@ -178,6 +179,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(folder / "still" / "log.csv", folder / calibration)
     for calibration in ("turns.csv", "turned.csv"):
         write_turns(folder / calibration)
+    shutil.copytree(ROOT / "configs", folder / "configs")
     quick = (ROOT / "configs" / "studies" / "quick.yaml").read_text(encoding="utf-8")
     (folder / "quick.yaml").write_text(re.sub(r"(?m)^runs: \d+", "runs: 2", quick), encoding="utf-8")
     result = rg.smooth(rg.read_log(folder / "log.csv", config), config)

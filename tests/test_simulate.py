@@ -73,7 +73,8 @@ def test_scenarios_begin_and_end_at_rest_and_keep_their_speed(name):
     assert np.abs(motion.v_n[resting]).max() < 1e-6 and np.abs(motion.w_b[resting]).max() < 1e-6
     assert np.linalg.norm(path.motion([path.duration]).v_n) < 1e-9
     np.testing.assert_allclose(motion.p_n[0, :2], 0.0, atol=1e-9)
-    assert 0.25 < np.linalg.norm(motion.v_n, axis=1).max() < 0.5
+    fastest = np.linalg.norm(motion.v_n, axis=1).max()
+    assert fastest < 0.1 if name in ("hold", "spin") else 0.25 < fastest < 0.5
     assert np.linalg.norm(motion.a_n, axis=1).max() < 0.5
 
 

@@ -30,12 +30,12 @@ from rovgraph.lab.misalignment import study as study_cells
 from rovgraph.lab.misalignment.results import kept_so_far
 from rovgraph.lab.observability import Observability, estimating
 from rovgraph.lab.observability import observe as observe_calibration
-from rovgraph.lab.plan import KnownComponents, Plan, SensorRates
+from rovgraph.lab.plan import CANDIDATES, KnownComponents, Plan, SensorRates, usual
 from rovgraph.lab.plan import manoeuvres as candidates_of
 from rovgraph.lab.plan import plan as ranked
 from rovgraph.lab.runs import Case, Recorded, Run, Simulated
 from rovgraph.log import Log
-from rovgraph.model.config import Config, completed, config_or_defaults
+from rovgraph.model.config import Config, beliefs, completed, config_or_defaults
 from rovgraph.process import Progress, no_progress
 from rovgraph.simulate.named import require_known
 
@@ -234,7 +234,7 @@ def require_one(
         raise InputError(f"{source}: a reference (CSV with time, north, east) is needed to compare with")
 
 
-DURATION_S = 120.0  # of a manoeuvre
+DURATION_S, SURVEY_S = 120.0, 900.0  # of a manoeuvre, and of one that survey crews do
 USUAL = SensorRates()
 
 
@@ -326,7 +326,7 @@ def plan(
     config: Config | None = None,
     goals: Mapping[str, float] | Sequence[str] | None = None,
     known: ObservabilityResult | Path | str | None = None,
-    duration: float = DURATION_S,
+    duration: float | None = None,
     manoeuvres: str | Sequence[str] | None = None,
     estimate: str | Sequence[str] = (),
     sensors: SensorRates = USUAL,
@@ -337,10 +337,11 @@ def plan(
     Parameters
     ----------
     config : of vehicle and sensors; None = all defaults
-    goals : label of a component -> wanted sd, radians and SI; or texts such as "dvl_yaw=1deg"
+    goals : label of a component -> wanted sd, radians and SI; or texts such as "dvl_yaw=1deg"; what the configuration
+        considers is estimated where it is a goal
     known : result of an earlier dive, or its ``observability.json``; None = none
-    duration : of each manoeuvre [s]
-    manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all
+    duration : of each manoeuvre [s]; None = 120, or 900 where a goal is acoustic
+    manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all that serve the goals
     estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     sensors : their rates
     progress : called at times with the current task and its progress from 0 to 1
@@ -349,9 +350,13 @@ def plan(
     ------
     InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
     """
-    config = estimating(config_or_defaults(config), listed(estimate))
-    candidates = candidates_of(listed(manoeuvres) or None, duration)
     wanted = read_goals(goals)
+    config = config_or_defaults(config)
+    considered = [name for name, b in beliefs(config).items() if b.considered and {*b.variable.labels} & {*wanted}]
+    config = estimating(config, [*listed(estimate), *considered])
+    names = usual(config, wanted)
+    duration = duration or (DURATION_S if names == CANDIDATES else SURVEY_S)
+    candidates = candidates_of(listed(manoeuvres) or names, duration)
     before: KnownComponents | None
     if isinstance(known, ObservabilityResult):
         seen, source = known.observability, known.about["log"]

@@ -20,7 +20,8 @@ def simulate(
         str,
         typer.Argument(
             help="driven by thrusters: vattern, docking, excited, tank, stationary; "
-            "prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral",
+            "prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral; "
+            "around a beacon: hold, spin, cardinal, box, round",
             show_default=False,
         ),
     ],
@@ -46,6 +47,14 @@ def simulate(
         bool | None,
         typer.Option(
             "--disturbances/--no-disturbances", help="iron on the seabed; default: in a lake", show_default=False
+        ),
+    ] = None,
+    depth: Annotated[float | None, typer.Option(help="depth at the start in m; default: the scenario's")] = None,
+    ship: Annotated[
+        str | None,
+        typer.Option(
+            help="what the ship does of an acoustic system: spin, cardinal, box or round; default: it stays above",
+            show_default=False,
         ),
     ] = None,
     outliers: Annotated[float, typer.Option(help="share of DVL pings that are wrong, 0 to 1")] = 0.0,
@@ -81,6 +90,8 @@ def simulate(
         variant=variant,
         current=current,
         disturbances=disturbances,
+        depth=depth,
+        ship=ship,
         outliers=outliers,
         dropouts=tuple(_pair(text) for text in dropout or ()),
         places=tuple(_pair(text) for text in place or ()),
@@ -248,12 +259,18 @@ def plan(
     config: ConfigPath = None,
     known: Annotated[Path | None, typer.Option(help="observability.json of an earlier dive; default: none")] = None,
     goal: Annotated[
-        list[str] | None, typer.Option(help="wanted sd, such as dvl_yaw=1deg; may be repeated", metavar="NAME=SD")
+        list[str] | None,
+        typer.Option(help="wanted sd, such as dvl_yaw=1deg or beacon=1m; may be repeated", metavar="NAME=SD"),
     ] = None,
-    duration: Annotated[float, typer.Option(help="duration of each manoeuvre in seconds")] = 120.0,
+    duration: Annotated[
+        float | None,
+        typer.Option(help="duration of each manoeuvre in seconds; default: 120, or 900 where a goal is acoustic"),
+    ] = None,
     manoeuvres: Annotated[
         str | None,
-        typer.Option(help="scenarios, such as circle or circle@0.3 (m/s), separated by commas; default: all"),
+        typer.Option(
+            help="scenarios, such as circle or circle@0.3 (m/s), separated by commas; default: all that serve the goals"
+        ),
     ] = None,
     estimate: Annotated[
         str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
@@ -282,7 +299,7 @@ def plan(
         result = rg.plan(settings, wanted, known, duration, manoeuvres, estimate or (), sensors, progress)
     result.save(out, force)
     shown = console()
-    for part in fitting(plan_table(result.plan, f"manoeuvres of {duration:g} s"), shown):
+    for part in fitting(plan_table(result.plan, f"manoeuvres of {result.plan.duration:g} s"), shown):
         shown.print(part)
     say(shown, f"results in {out}")
 

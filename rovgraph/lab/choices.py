@@ -10,7 +10,9 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.lab.plan import KnownComponents
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import TABLE, beacon_names
+
+FIRST_BEACON = beacon_names(0)[0]
 
 
 def listed(names: str | Iterable[str] | None) -> list[str]:
@@ -31,7 +33,8 @@ def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
 
     Parameters
     ----------
-    wanted : such a mapping, or texts such as ``dvl_yaw=1deg`` and ``dvl_scale=0.002``
+    wanted : such a mapping, or texts such as ``dvl_yaw=1deg``, ``dvl_scale=0.002`` and ``usbl_arm=0.1m``; a variable's
+        name stands for all its components, and ``beacon`` for the place of the first one
 
     Raises
     ------
@@ -40,7 +43,7 @@ def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     if wanted is not None and not isinstance(wanted, Mapping | Sequence):
         raise InputError(f"goals: {wanted!r}, expected a mapping of components to sds, or texts such as 'dvl_yaw=1deg'")
     if not isinstance(wanted, Mapping):
-        return dict(_goal(text) for text in wanted or ())
+        return {label: sd for text in wanted or () for label, sd in _goal(text).items()}
     for label, sd in wanted.items():
         if not (isinstance(sd, int | float) and math.isfinite(sd) and sd > 0.0):
             raise InputError(
@@ -49,24 +52,27 @@ def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     return dict(wanted)
 
 
-def _goal(text: str) -> tuple[str, float]:
+def _goal(text: str) -> dict[str, float]:
     label, _, number = text.partition("=")
     label = label.strip()
-    variable = next((v for v in TABLE.values() if label in v.labels), None)
+    label = FIRST_BEACON if label == "beacon" else label
+    variable = next((v for v in TABLE.values() if label in (v.name, *v.labels)), None)
     if variable is None:
         every = [known for v in TABLE.values() for known in v.labels]
         near = difflib.get_close_matches(label, every, 1)
         raise InputError(f"goal {text!r}: unknown component {label!r}" + (f", did you mean {near[0]}?" if near else ""))
     number, degrees = number.strip(), number.strip().endswith("deg")
+    unit = "deg" if variable.angular else variable.unit if variable.unit.isalpha() else ""
     try:
-        sd = float(number.removesuffix("deg"))
+        sd = float(number.removesuffix(unit))
     except ValueError:
         sd = math.nan
-    if not (math.isfinite(sd) and sd > 0.0) or degrees != variable.angular:
+    if not (math.isfinite(sd) and sd > 0.0 and degrees == variable.angular):
         raise InputError(
             f"goal {text!r}: expected {label}=" + ("1deg" if variable.angular else f"0.01 [{variable.unit}]")
         )
-    return label, math.radians(sd) if degrees else sd
+    labels = [label] if label in variable.labels else variable.labels
+    return dict.fromkeys(labels, math.radians(sd) if degrees else sd)
 
 
 def read_known(path: Path) -> KnownComponents:

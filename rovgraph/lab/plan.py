@@ -1,11 +1,12 @@
 """Ranks manoeuvres by how well they determine the calibration: the work of ``rovgraph plan``.
 
-The manoeuvres are scenarios of the simulator, each at some speeds. The information of a dive depends on where it is
-linearised, not on the noise. So a manoeuvre is simulated without noise for a vehicle with the configured sensors, the
-graph is linearised there, and the information that you already have is added.
+The manoeuvres are scenarios of the simulator, each at some speeds; of an acoustic system those that survey crews do,
+the vehicle around a beacon or below the ship, or the ship around the vehicle. The information of a dive depends on
+where it is linearised, not on the noise. So a manoeuvre is simulated without noise for a vehicle with the configured
+sensors, the graph is linearised there, and the information that you already have is added.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,22 +17,52 @@ from rovgraph.geometry import Array
 from rovgraph.lab.executors import cores, in_workers
 from rovgraph.lab.observability import Observability, examined, joint_bits, solved
 from rovgraph.log import Log
+from rovgraph.model.calibration import ACOUSTICS, TABLE, beacon_names
 from rovgraph.model.config import AS_WRITTEN, Config, beliefs
+from rovgraph.model.config_sections import Usbl
 from rovgraph.simulate import CALM, Path, Style, Truth, scenario, simulate
+from rovgraph.simulate.scenario import MANOEUVRE_DEPTH_M, MANOEUVRES
 
 CANDIDATES = ("straight", "lawnmower", "square", "circle", "figure8", "accelerate-and-stop", "spiral")
 SPEEDS = (0.25, 0.5)  # [m/s]
+OF_SHIP = "ship-"  # of a manoeuvre that the ship does, while the vehicle stays on the bottom
+ABOVE_BEACON_M = 15.0  # of the vehicle
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A scenario at a speed [m/s]."""
+    """A scenario at a speed [m/s]; None = at the one that takes the time given."""
 
     name: str
-    speed: float
+    speed: float | None
 
     def __str__(self) -> str:
-        return f"{self.name}@{self.speed:g}"
+        return self.name if self.speed is None else f"{self.name}@{self.speed:g}"
+
+    @property
+    def scenario(self) -> str:
+        """The scenario's name."""
+        return self.name.removeprefix(OF_SHIP)
+
+    @property
+    def of_ship(self) -> bool:
+        """Whether the ship does it."""
+        return self.name.startswith(OF_SHIP)
+
+
+def usual(config: Config, goals: Collection[str]) -> tuple[str, ...]:
+    """Names of the manoeuvres that serve some goals.
+
+    Parameters
+    ----------
+    config : with the acoustic system
+    goals : labels; where one is acoustic, what survey crews do
+    """
+    acoustic = {label for v in TABLE.values() if set(v.sensors) <= set(ACOUSTICS) for label in v.labels}
+    if not acoustic & set(goals):
+        return CANDIDATES
+    ship = tuple(OF_SHIP + name for name in MANOEUVRES) if config.usbl != Usbl() and config.usbl.head == "ship" else ()
+    return (*MANOEUVRES, *ship)
 
 
 def manoeuvres(names: Sequence[str] | None, duration: float) -> list[Manoeuvre]:
@@ -49,8 +80,9 @@ def manoeuvres(names: Sequence[str] | None, duration: float) -> list[Manoeuvre]:
     chosen: dict[Manoeuvre, None] = {}
     for text in names or CANDIDATES:
         name, at, speed = text.partition("@")
-        for one in (_number(speed, text),) if at else SPEEDS:
-            scenario(name, duration, one)  # refuses what cannot be
+        survey = name.removeprefix(OF_SHIP) in MANOEUVRES
+        for one in (_number(speed, text),) if at else (None,) if survey else SPEEDS:
+            scenario(name.removeprefix(OF_SHIP) if survey else name, duration, one)  # refuses what cannot be
             chosen[Manoeuvre(name, one)] = None
     return list(chosen)
 
@@ -171,9 +203,10 @@ class Plan:
         return sorted(np.argsort(self.ranked[0].sd / self.before)[:MOST_COLUMNS].tolist())
 
     def path(self) -> Path:
-        """That of the best manoeuvre."""
+        """That of the best manoeuvre, of who does it."""
         best = self.ranked[0].manoeuvre
-        return path_of(best, self.duration)
+        path = path_of(best, self.duration)
+        return path.shifted([0.0, 0.0, -MANOEUVRE_DEPTH_M]) if best.of_ship else path
 
 
 def plan(
@@ -236,20 +269,47 @@ def _check(goals: Mapping[str, float], estimated: Sequence[str]) -> None:
 
 def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
     """A manoeuvre in calm water: the information from waves cannot be planned."""
-    return scenario(manoeuvre.name, duration, manoeuvre.speed, Style(waves=CALM))
+    return scenario(manoeuvre.scenario, duration, manoeuvre.speed, Style(waves=CALM))
 
 
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
     """Predicted observability of a manoeuvre by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
     as_written = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
+    path, ship = path_of(manoeuvre, duration), None
+    if manoeuvre.of_ship:
+        ship, path = path, scenario("hold", duration, None, Style(waves=CALM))
+        ship = ship.shifted([0.0, 0.0, -MANOEUVRE_DEPTH_M])
+    elif manoeuvre.scenario in MANOEUVRES:
+        path, as_written = _above_beacons(path, as_written)
     truth = Truth(
         as_written, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
-        fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
+        fix_interval=sensors.fix_interval, ahrs_rate=ahrs, ship=ship,
     )  # fmt: skip
-    dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
+    dive = simulate(path, truth, np.random.default_rng(0))
     log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
     return examined(solved(log, as_written), as_written, noisy=False)
+
+
+def _above_beacons(path: Path, config: Config) -> tuple[Path, Config]:
+    """A path above the first beacon, or where it is not known above the origin; beacons are linearised in their places.
+
+    Their priors keep the uncertainty of the configuration.
+    """
+    if not config.beacons:
+        return path, config
+    believed, placed = beliefs(config), []
+    start = path.motion([0.0]).p_n[0]
+    for k, beacon in enumerate(config.beacons):
+        place, down = (believed[name] for name in beacon_names(k))
+        depth = float(start[2]) + ABOVE_BEACON_M if beacon.down_m is None else beacon.down_m
+        known = {"north_m": place.mean[0], "east_m": place.mean[1], "sd_m": place.sd}
+        placed.append(beacon.model_copy(update={**known, "down_m": depth, "down_sd_m": down.sd}))
+    first = placed[0]
+    above = np.array([first.north_m, first.east_m, max(float(first.down_m or 0.0) - ABOVE_BEACON_M, 1.0)])
+    first_place = config.start.model_copy(update={"north_m": float(above[0]), "east_m": float(above[1])})
+    shifted = path.shifted(above - [*np.zeros(2), start[2]])
+    return shifted, config.model_copy(update={"beacons": tuple(placed), "start": first_place})
 
 
 def _with(already: Array, seen: Observability, manoeuvre: Manoeuvre) -> Prediction:

@@ -696,7 +696,8 @@ def draw_path(plan: Plan) -> Figure:
     axes.invert_yaxis()
     axes.set_xlabel("time [s]")
     best = plan.ranked[0].manoeuvre
-    figure.suptitle(f"{best.name} at {best.speed:g} m/s; it begins at the dot", x=0.01, ha="left", fontsize=9)
+    at = "" if best.speed is None else f" at {best.speed:g} m/s"
+    figure.suptitle(f"{best.name}{at}; it begins at the dot", x=0.01, ha="left", fontsize=9)
     return figure
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from rovgraph.errors import InputError
 
 CURRENT_MAX = 1.0  # that may be chosen [m/s]
+DEEPEST_M = 11_000.0
 DURATION_MAX = 6 * 3600.0  # beyond it the log outgrows the memory [s]
 EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places", "false_places"})
 
@@ -23,6 +24,8 @@ class Choices:
     variant : one of the scenario's variants
     current : north, east [m/s]
     disturbances : iron on the seabed
+    depth : at which the dive begins [m]
+    ship : what the ship of an acoustic system does, one of `rovgraph.simulate.scenario.MANOEUVRES`
     outliers : share of DVL pings that are wrong, 0 to 1
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of places that a camera recognises
@@ -35,6 +38,8 @@ class Choices:
     variant: str | None = None
     current: tuple[float, float] | None = None
     disturbances: bool | None = None
+    depth: float | None = None
+    ship: str | None = None
     outliers: float = 0.0
     dropouts: tuple[tuple[float, float], ...] = ()
     places: tuple[tuple[float, float], ...] = ()
@@ -52,6 +57,8 @@ class Choices:
         self._require_numbers()
         if self.duration is not None and self.duration > DURATION_MAX:
             raise InputError(f"duration of {self.duration} s: at most {DURATION_MAX:.0f} s")
+        if self.depth is not None and not 0.0 <= self.depth <= DEEPEST_M:
+            raise InputError(f"depth of {self.depth} m: between 0 and {DEEPEST_M:g} m are expected")
         for first, last in self.dropouts:
             if not 0.0 <= first < last:
                 raise InputError(f"dropout {first:g}:{last:g}: two times in seconds are expected, as 100:130")
@@ -60,7 +67,7 @@ class Choices:
                 raise InputError(f"place {north:g}:{east:g}: north and east in metres are expected, as 10:-5")
 
     def _require_numbers(self) -> None:
-        for name in ("duration", "speed", "outliers", "false_places"):
+        for name in ("duration", "speed", "depth", "outliers", "false_places"):
             value = getattr(self, name)
             if not (value is None or isinstance(value, Real)):
                 raise InputError(f"{name} {value!r}: a number is expected")
@@ -74,7 +81,7 @@ class Choices:
     def summary(self) -> dict[str, Any]:
         """Entries of ``summary.json``: the common ones always, the others where they were chosen."""
         common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
-        others = {name: getattr(self, name) for name in ("variant", "current", "disturbances")}
+        others = {name: getattr(self, name) for name in ("variant", "current", "disturbances", "depth", "ship")}
         others |= {name: getattr(self, name) or None for name in ("dropouts", "places", "false_places")}
         return common | {name: value for name, value in others.items() if value is not None}
 

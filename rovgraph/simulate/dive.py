@@ -31,6 +31,7 @@ from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
 from rovgraph.model.state import State
 from rovgraph.sensors import SENSORS, field_direction
 from rovgraph.sensors.instruments import instruments
+from rovgraph.simulate.acoustic import AcousticSampler, has_acoustics, lay_beacons, ship_path
 from rovgraph.simulate.environment import compass_turn
 from rovgraph.simulate.path import Motion, Path
 from rovgraph.simulate.truth import Truth, correlated, of_waves, remembered
@@ -186,6 +187,10 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     truth : Truth
     rng : numpy Generator; the same seed gives the same dive
     """
+    acoustic = rng.spawn(1)[0] if has_acoustics(truth.config) else None  # the dives of old seeds stay
+    if acoustic is not None:
+        places = lay_beacons(truth.config, path, acoustic if truth.noise else None)
+        truth = replace(truth, calibration={**places, **truth.calibration})
     calibration = truth.draw_calibration(rng)
     lasting = draw_lasting(truth, calibration, path.duration, rng)
     bias_start, offset = truth.draw_bias(rng), truth.draw_start(rng)
@@ -200,9 +205,13 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     makers = (_depths, _attitudes, _autopilot_headings, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
+    if acoustic is not None:
+        frames += _acoustics(sample, path, acoustic)
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     calibration |= {name: values[-1] for name, values in lasting.at(time).items()}
+    absent = {name for name, belief in beliefs(truth.config).items() if belief.streams == ()}
+    calibration = {name: value for name, value in calibration.items() if name not in absent}
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
     hidden["lasting"] = lasting
     return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)
@@ -242,11 +251,14 @@ class _Sampler:
         late = 0.0 if offset is None else float(self.calibration[offset][0])
         return path.motion(np.clip(stamps - late, 0.0, path.duration))
 
+    def state(self, motion: Motion) -> State:
+        """The true state; biases are none of the sensors' that have models."""
+        calibration = {**self.calibration, **self.lasting.at(motion.time)}
+        return State(motion.R_nb, motion.p_n, motion.v_n, np.zeros((len(motion), 6)), calibration)
+
     def exact(self, sensor: str, motion: Motion) -> Array:
         """The measurement without noise, shape (n, dim)."""
-        zero = np.zeros((len(motion), 6))
-        state = State(motion.R_nb, motion.p_n, motion.v_n, zero, {**self.calibration, **self.lasting.at(motion.time)})
-        z = self.instruments[sensor].model.predict(state, motion.w_b)[0]
+        z = self.instruments[sensor].model.predict(self.state(motion), motion.w_b)[0]
         return self._disturbed(sensor, motion, z) if len(self.truth.magnetism.iron.p_n) else z
 
     def _disturbed(self, sensor: str, motion: Motion, z: Array) -> Array:
@@ -431,6 +443,20 @@ def _stretches(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last index of every stretch of True."""
     steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
+
+
+def _acoustics(sample: _Sampler, path: Path, rng: np.random.Generator) -> list[pd.DataFrame]:
+    """The ship, and what its head and ranges measure."""
+    truth = sample.truth
+
+    def epochs(time: Array) -> tuple[State, Array]:
+        motion = path.motion(np.clip(time, 0.0, path.duration))
+        return sample.state(motion), motion.w_b
+
+    ship = ship_path(None, path, rng if truth.noise else None) if truth.ship is None else truth.ship
+    late = {sensor: float(sample.calibration[f"{sensor}_time_offset"][0]) for sensor in ("usbl", "range")}
+    noise = rng if truth.noise else None
+    return AcousticSampler(truth.config, sample.instruments, ship, epochs, late, noise).frames()
 
 
 def _signals(sample: _Sampler, path: Path) -> pd.DataFrame | None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from rovgraph.errors import InputError, kind_of
 from rovgraph.model.config import Config, config_or_defaults, parse_config
+from rovgraph.simulate.acoustic import has_acoustics, ship_path
 from rovgraph.simulate.choices import Choices
 from rovgraph.simulate.dive import Dive, simulate
 from rovgraph.simulate.driven import DRIVEN, World
@@ -18,7 +19,7 @@ from rovgraph.simulate.scenario import SCENARIOS, scenario
 from rovgraph.simulate.truth import Truth
 
 NAMES = tuple(dict.fromkeys([*SCENARIOS, *DRIVEN]))
-_KINEMATIC = frozenset({"duration", "speed"})
+_KINEMATIC = frozenset({"duration", "speed", "depth", "ship"})
 _OWN = Choices()
 
 
@@ -77,6 +78,8 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
         choices.require(name, _KINEMATIC)
         config = config_or_defaults(config)
         path = scenario(name, choices.duration, choices.speed)
+        if choices.depth is not None:
+            path = path.shifted([0.0, 0.0, choices.depth - path.motion([0.0]).p_n[0, 2]])
         truth = _kinematic(path, config, choices, seed)
     dive = simulate(path, truth, np.random.default_rng(seed))
     return dive, known(dive, config)
@@ -91,7 +94,12 @@ def _kinematic(path: Path, config: Config, choices: Choices, seed: int) -> Truth
         dropouts=choices.dropouts,
         places=choices.places,
         false_places=choices.false_places,
+        ship=None if choices.ship is None else ship_path(choices.ship, path, np.random.default_rng([seed, 2])),
     )
+    if choices.ship is not None and not has_acoustics(config):
+        raise InputError(
+            f"ship {choices.ship}: the configuration has no acoustic system; state usbl, beacons or receivers"
+        )
     if not choices.disturbances:
         return truth
     return replace(truth, magnetism=Magnetism(iron_near(path, config, np.random.default_rng([seed, 1]))))

@@ -5,7 +5,7 @@ A scenario is a function of duration and speed (either may be None for its defau
 """
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -139,6 +139,39 @@ def _vattern() -> Route:
     return Route.of(VATTERN)
 
 
+def _turning(turns: float) -> Scenario:
+    """At one place: turns to starboard, and as many back."""
+
+    def make(duration: float | None, speed: float | None, style: Style) -> Path:
+        duration = 480.0 if duration is None else duration
+        steps = np.append(np.arange(9), np.arange(7, -1, -1))
+        place, stay = np.tile([0.0, 0.0, MANOEUVRE_DEPTH_M], (len(steps) + 1, 1)), moving_time(duration, style)
+        route = Route.of(place, pause=stay / (len(steps) - 1), crab=0.25 * np.pi * turns * steps)
+        return path_along(route, 1.0, duration, style)
+
+    return make
+
+
+def _above(points: Sequence[tuple[float, float]], pause: float = 0.0) -> Route:
+    """From the middle along points, north and east in units of the manoeuvres' radius, and back."""
+    there = [(0.0, 0.0), *points, (0.0, 0.0)]
+    size = MANOEUVRE_RADIUS_M
+    return Route.of([(size * north, size * east, MANOEUVRE_DEPTH_M) for north, east in there], pause=pause)
+
+
+def _round() -> Route:
+    """Out to a circle, once round, and back."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    return _above([(float(np.cos(a)), float(np.sin(a))) for a in angle])
+
+
+# What survey crews do above a beacon, or around it, to calibrate an acoustic system. Two lines through the middle, in
+# both senses, pass the cardinal points on reciprocal headings; four sides and two diagonals are the box of six lines.
+MANOEUVRE_DEPTH_M, MANOEUVRE_RADIUS_M = 50.0, 25.0
+MANOEUVRES = ("spin", "cardinal", "box", "round")
+_CARDINAL = _above([(1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)], pause=10.0)
+_BOX = _above([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1), (-1, -1), (-1, 1), (1, -1)])
+
 SCENARIOS: dict[str, Scenario] = {
     "falcon": _endless(_falcon(), 0.35),
     "lawnmower": _endless(_lawnmower(), 0.4),
@@ -149,4 +182,9 @@ SCENARIOS: dict[str, Scenario] = {
     "accelerate-and-stop": _endless(_accelerate_and_stop(), 0.4),
     "spiral": _endless(_spiral(), 0.4),
     "vattern": _once(_vattern(), 0.3),
+    "hold": _turning(0.0),
+    "spin": _turning(1.0),
+    "cardinal": _once(_CARDINAL, 0.4),
+    "box": _once(_BOX, 0.4),
+    "round": _once(_round(), 0.4),
 }

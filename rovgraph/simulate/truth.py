@@ -16,6 +16,7 @@ from rovgraph.model.config import Config, beliefs
 from rovgraph.model.gauss_markov import stationary_walk, walked
 from rovgraph.model.thesis import R_DVL, R_MTI, SAMPLE_S
 from rovgraph.simulate.environment import UNDISTURBED, Magnetism
+from rovgraph.simulate.path import Path
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,7 @@ class Truth:
     places : north, east [m] of each place that a camera recognises, 1, 2, ... in the log
     place_radius : how near the camera has to come [m]
     false_places : part of the landmarks that are of another spot
+    ship : what the ship of an acoustic system does; None = it stays near the dive's middle
     """
 
     config: Config = field(default_factory=Config)
@@ -141,6 +143,7 @@ class Truth:
     places: tuple[tuple[float, float], ...] = ()
     place_radius: float = 1.0
     false_places: float = 0.0
+    ship: Path | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.outlier_share <= 1.0:

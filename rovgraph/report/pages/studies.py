@@ -258,7 +258,8 @@ def plan_page(source: ResultsSource) -> str:
     goals, labels = summary.get("goals") or {}, [*(summary.get("sd_before") or {})]
     labels.sort(key=lambda label: label not in goals)
     factors = {label: shown(unit_of(label))[0] for label in labels}
-    names = [f"{p['manoeuvre']} at {p['speed_mps']:g} m/s" for p in ranking]
+    at = ("" if p["speed_mps"] is None else f" at {p['speed_mps']:g} m/s" for p in ranking)
+    names = [p["manoeuvre"] + speed for p, speed in zip(ranking, at, strict=True)]
     head = ("manoeuvre", "bits", *(f"{label_with_unit(label, unit_of(label))}, sd" for label in labels))
     sentences = [("as known before", "", summary.get("sd_before") or {})]
     sentences += [(name, f"{p['bits']:.1f}", p["sd"] or {}) for name, p in zip(names, ranking, strict=True)]
