@@ -41,7 +41,8 @@ def result():
             "usbl_elevation": np.arcsin(off[:, 2] / length) + rng.normal(0.0, 0.01, len(time)),
         }
     )
-    ranges = pd.DataFrame({"time": time + 0.5, "range": np.linalg.norm(p - BEACON, axis=1), "range_beacon": 7})
+    far = np.linalg.norm(p - BEACON, axis=1) + rng.normal(0.0, 0.1, len(time))
+    ranges = pd.DataFrame({"time": time + 0.5, "range": far, "range_beacon": 7})
     frame = pd.concat([made.log.to_frame(), replies, ranges]).sort_values("time", kind="stable")
     said = {
         "ship": {"north_m": -10.0, "east_m": 20.0, "heading_deg": 30.0},

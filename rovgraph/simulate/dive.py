@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, earth_rate_n, rotate, rpy_from_matrix, transpose, wrap_angle
 from rovgraph.inference.trajectory import Trajectory
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
 from rovgraph.model.state import State
 from rovgraph.sensors import SENSORS, field_direction
@@ -210,7 +211,11 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     calibration |= {name: values[-1] for name, values in lasting.at(time).items()}
-    absent = {name for name, belief in beliefs(truth.config).items() if belief.streams == ()}
+    absent = {
+        name
+        for name, belief in beliefs(truth.config).items()
+        if belief.streams == () or (acoustic is None and {*belief.variable.sensors} <= {*ACOUSTICS})
+    }
     calibration = {name: value for name, value in calibration.items() if name not in absent}
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
     hidden["lasting"] = lasting
