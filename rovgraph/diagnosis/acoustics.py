@@ -47,6 +47,8 @@ def find_head_errors(log: Log, problem: Problem, initial: InitialConditions) -> 
     """
     if "usbl" not in initial.instruments or not {"dvl", "dvl_water"} & log.sensors:
         return []
+    if initial.config.usbl.head == "vehicle" and any(beacon.north_m is None for beacon in initial.config.beacons):
+        return []  # directions to where nobody knows
     states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
     replies = log["usbl"]
     if len(replies) > MOST:
