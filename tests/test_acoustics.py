@@ -3,6 +3,7 @@
 import re
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -373,6 +374,25 @@ def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told(
     beacon = {e.label: e for e in filtered.estimates[0].calibration}
     assert filtered.estimates[0].kind == "filtered" and filtered.verdict == "doubtful"
     assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+
+
+def test_a_dive_with_a_usbl_alone_begins_where_it_puts_the_vehicle():
+    dive = below_ship(Setting(seconds=60.0), 1)
+    dive = replace(dive, streams={s: x for s, x in dive.streams.items() if s not in ("dvl", "depth")})
+    error, found = rms(campaign_log(dive), dive)
+    assert error < 1.5 and found.verdict == "trusted"
+
+
+def test_beacons_without_a_depth_are_sought_below_the_track():
+    dive = acoustics.among_beacons(0, 4, 0.5, 1.0, 0.0, seconds=120.0)
+    placed = [{key: b[key] for key in ("name", "north_m", "east_m", "sd_m")} for b in dive.configuration["beacons"]]
+    truth = [b["down_m"] for b in dive.configuration["beacons"]]
+    error, found = rms(campaign_log(replace(dive, configuration={**dive.configuration, "beacons": placed})), dive)
+    entries = {e.label: e for e in found.estimates[0].calibration}
+    off = [
+        (entries[f"beacon_{k + 1}_down"].value - z) / entries[f"beacon_{k + 1}_down"].sd for k, z in enumerate(truth)
+    ]
+    assert error < 0.5 and found.verdict == "trusted" and np.abs(off).max() < 3.0
 
 
 @pytest.mark.slow

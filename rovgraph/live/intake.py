@@ -90,7 +90,9 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if b.north_m is None}
+        self._unplaced = {
+            label_number(str(b.name)): str(b.name) for b in config.beacons if None in (b.north_m, b.down_m)
+        }
         self._only_beacon = len(config.beacons) == 1
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
@@ -137,7 +139,9 @@ class Intake:
             return False
         why = f"beacon {name} has no place"
         if not self._left_out[sensor, why]:
-            remedy = "rovgraph smooth of the recording finds it; then state north_m, east_m and sd_m under beacons"
+            remedy = (
+                "rovgraph smooth of the recording finds it; then state north_m, east_m, down_m and sds under beacons"
+            )
             self.news.append((sensor, f"{why}, and its ranges are left out: {remedy}"))
         self._left_out[sensor, why] += 1
         return True
