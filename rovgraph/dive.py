@@ -182,20 +182,21 @@ class _Solver:
                 self.estimates, states = [filtered], passed if states is None else states
             if not self.beacons:
                 batch = batch.without_covariances()
-            if self.estimate != "filtered":
+            if self.estimate != "filtered" or any(beacon.other is not None for beacon in self.beacons):
                 self.progress("smoothing", 0.5)
                 self.best = batch.optimum(states)
                 moved = self._mirrored(batch)
                 if moved is not batch and self.estimates:
                     self.estimates = [_filtered(moved, self.progress)[0]]
                 batch = moved
-                self.estimates.insert(0, smoothed(self.best, self.initial))
+                if self.estimate != "filtered":
+                    self.estimates.insert(0, smoothed(self.best, self.initial))
         self._judge(batch)
 
     def _mirrored(self, batch: BatchSmoother) -> BatchSmoother:
         """Solve the dive with the other place of beacons that may lie on either side of it; keep the likelier one."""
         self.mirrors = []
-        for beacon in self.beacons:
+        for k, beacon in enumerate(self.beacons):
             if beacon.other is None or not isinstance(self.best, ChainOptimum):
                 continue
             initial = self.initial.believing(beacon.beliefs(self.initial, beacon.other))
@@ -203,6 +204,7 @@ class _Solver:
             if other.solution.cost < self.best.solution.cost:
                 self.best, other, self.initial = other, self.best, initial
                 batch = replace(batch, initial=initial)
+                self.beacons[k] = replace(beacon, best=beacon.other, other=beacon.best)  # if the dive is solved again
             places = [np.reshape(one.state.calibration[beacon.variable], (-1, 2))[-1] for one in (self.best, other)]
             margin, apart = other.solution.cost - self.best.solution.cost, places[0] - places[1]
             if np.linalg.norm(apart) > SAME_M:

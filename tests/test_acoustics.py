@@ -3,6 +3,7 @@
 import re
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
-from rovgraph.log import Log, Stream
+from rovgraph.live.intake import Intake
+from rovgraph.live.message import Reading
+from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import LAYOUT, TABLE, USBL_MOUNT
 from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
@@ -148,6 +151,77 @@ def test_replies_without_a_ship_near_are_counted_and_left_out():
     assert left_out == {("usbl", "without a position of the ship"): 1}
 
 
+def test_a_ship_that_says_no_tilt_any_more_makes_directions_less_precise():
+    found = acoustics_of(parse_config(""))
+    found.tracks["ship_tilt"].time, found.tracks["ship_tilt"].values = np.arange(2.0), np.zeros((2, 2))
+    near, far = (found.exchanges(reply(t, 150.0, 0.3, 0.8), 0.0, Counter()).data[0, 4] for t in (3.0, 15.0))
+    assert far**2 - near**2 == pytest.approx(np.radians(3.0) ** 2 - np.radians(0.1) ** 2)
+
+
+def test_the_ships_own_sd_takes_precedence():
+    found = acoustics_of(parse_config("{ship: {sd_m: 0.1}, usbl: {range_sd_m: 0.3}}"))
+    found.tracks["ship"].values[10:, 2] = 5.0
+    sds = [found.exchanges(reply(t, 15.0, 0.3, 0.8), 0.0, Counter()).data[0, 3] for t in (3.0, 15.0)]
+    np.testing.assert_allclose(sds, np.hypot(0.3, [0.1, 5.0]))
+
+
+def test_beyond_the_end_of_its_log_the_ship_goes_on_smoothly():
+    found, t = Acoustics(Config(), {}), np.arange(0.0, 20.0, 0.1)
+    noise = 0.1 * np.where(np.arange(len(t)) % 2, 1.0, -1.0)
+    found.tracks["ship"].take(t, np.column_stack([2.0 * t + noise, noise, noise]))
+    for end in (-2.0, 22.0):
+        assert found.tracks["ship"].at(np.array([end]), 3.0)[0][0, 0] == pytest.approx(2.0 * end, abs=0.8)
+
+
+def test_replies_without_a_length_are_left_out():
+    no_reply, soon = np.full((2, 1, 10), np.nan)
+    no_reply[0, 4:7], soon[0, 1:4] = 0.0, (0.1, 0.3, 0.8)
+    for row, config in ((no_reply, ""), (soon, "usbl: {turn_around_s: 0.3}")):
+        left_out: Counter[tuple[str, str]] = Counter()
+        stream = Stream("usbl", (), np.array([10.0]), row, np.array([2]))
+        assert not len(acoustics_of(parse_config(config)).exchanges(stream, 0.0, left_out))
+        assert left_out == {("usbl", "no length of its way: 0, or a travel time within the turn-around"): 1}
+
+
+def test_replies_do_not_wait_for_a_part_of_the_ship_that_has_fallen_silent():
+    found, late = Acoustics(Config(), {"usbl": instruments(Config())["usbl"]}), {"usbl": 0.0}
+    for t in np.arange(0.0, 40.0, 0.5):
+        says = {"ship": [2.0 * t, 0.0, np.nan], "ship_heading": [0.1 * t], "ship_tilt": [0.0, 0.0]}
+        for sensor, values in says.items() if t < 10.0 else list(says.items())[:2]:
+            found.insert(Measurement(t, sensor, np.array(values), 0), late, Counter())
+        made = found.insert(Measurement(t, "usbl", reply(t, 150.0, 0.3, 0.8).data[0], 0), late, Counter())
+    assert len(made) == 1 and not found.waiting
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.004])
+def test_receivers_at_a_jetty_are_paired_live_too(apart):
+    arms = {"0": (0.5, 0.5, 1.0), "1": (0.5, -0.5, 1.0), "2": (-0.5, -0.5, 1.0)}
+    ship = {"receivers": arms, "north_m": 0.0, "east_m": 0.0, "heading_deg": 0.0}
+    config = Config().changed(range={"one_way": True}, ship=ship)
+    found, made = Acoustics(config, {"range": instruments(config)["range"]}), []
+    for t in range(5):
+        for k in range(3):
+            values = np.array([15.0 + 0.1 * k, np.nan, np.nan, k, np.nan])
+            made += found.insert(Measurement(t + apart * k, "range", values, 0), {"range": 0.0}, Counter())
+    assert Counter(m.values[2 + at.WAYS] for m in made) == {0.0: 8, 1.0: 4}  # the last wait
+
+
+def test_another_transponder_at_the_same_time_ends_no_dive():
+    found, left_out = acoustics_of(parse_config("")), Counter()
+    for t, names in ((5.0, [1.0]), (6.0, [1.0, 2.0])):
+        rows = np.repeat(reply(t, 150.0, 0.3, 0.8).data, len(names), axis=0)
+        rows[:, 7] = names
+        stream = Stream("usbl", (), np.full(len(names), t), rows, np.arange(len(names)))
+        assert len(found.exchanges(stream, 0.0, left_out)) == 1
+    assert left_out == {("usbl", "another transponder than the first, without usbl.beacon"): 1}
+
+
+def test_a_range_without_a_name_to_an_unplaced_beacon_is_left_out_live():
+    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 4]
+    assert intake.measurement(1.0, Reading("range", np.array(range_only))) is None
+    assert "beacon wreck has no place" in intake.news[0][1]
+
+
 def test_depth_that_is_given_is_not_used_again():
     config = parse_config("usbl: {depth: given}")
     sd = acoustics_of(config).exchanges(reply(10.0, 750.0, 0.3, 0.8), 0.0, Counter()).data[0, 3:6]
@@ -179,6 +253,9 @@ def test_a_profile_is_read_from_rows_and_files_and_what_is_none_is_refused(tmp_p
     for bad in (((50.0, 1490.0), (0.0, 1510.0)), ((0.0, 4954.0), (50.0, 4888.0)), ((0.0, 1500.0),)):
         with pytest.raises(InputError, match=r"sound\.profile: "):
             profile_of(bad)
+    (tmp_path / "cast.csv").write_text("depth,sound_speed\nm,m/s\n0,1510\n")
+    with pytest.raises(InputError, match="are no numbers"):
+        _read.__wrapped__(tmp_path / "cast.csv")
     (tmp_path / "cast.csv").write_text("depth,c\n0,1510\n")
     with pytest.raises(InputError, match="expected columns depth and sound_speed"):
         _read.__wrapped__(tmp_path / "cast.csv")
@@ -293,6 +370,29 @@ def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told(
     beacon = {e.label: e for e in found.estimates[0].calibration}
     assert found.verdict == "doubtful" and "mirrored" in found.warnings[0]
     assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+    filtered = smooth(*campaign_log(dive), "filtered")
+    beacon = {e.label: e for e in filtered.estimates[0].calibration}
+    assert filtered.estimates[0].kind == "filtered" and filtered.verdict == "doubtful"
+    assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+
+
+def test_a_dive_with_a_usbl_alone_begins_where_it_puts_the_vehicle():
+    dive = below_ship(Setting(seconds=60.0), 1)
+    dive = replace(dive, streams={s: x for s, x in dive.streams.items() if s not in ("dvl", "depth")})
+    error, found = rms(campaign_log(dive), dive)
+    assert error < 1.5 and found.verdict == "trusted"
+
+
+def test_beacons_without_a_depth_are_sought_below_the_track():
+    dive = acoustics.among_beacons(0, 4, 0.5, 1.0, 0.0, seconds=120.0)
+    placed = [{key: b[key] for key in ("name", "north_m", "east_m", "sd_m")} for b in dive.configuration["beacons"]]
+    truth = [b["down_m"] for b in dive.configuration["beacons"]]
+    error, found = rms(campaign_log(replace(dive, configuration={**dive.configuration, "beacons": placed})), dive)
+    entries = {e.label: e for e in found.estimates[0].calibration}
+    off = [
+        (entries[f"beacon_{k + 1}_down"].value - z) / entries[f"beacon_{k + 1}_down"].sd for k, z in enumerate(truth)
+    ]
+    assert error < 0.5 and found.verdict == "trusted" and np.abs(off).max() < 3.0
 
 
 @pytest.mark.slow

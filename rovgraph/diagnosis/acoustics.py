@@ -47,6 +47,8 @@ def find_head_errors(log: Log, problem: Problem, initial: InitialConditions) -> 
     """
     if "usbl" not in initial.instruments or not {"dvl", "dvl_water"} & log.sensors:
         return []
+    if initial.config.usbl.head == "vehicle" and any(beacon.north_m is None for beacon in initial.config.beacons):
+        return []  # directions to where nobody knows
     states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
     replies = log["usbl"]
     if len(replies) > MOST:
@@ -235,6 +237,7 @@ class BeaconPlaces:
     name, number : as the configuration names it, and which of ``beacons`` it is, from 0
     best, other : ndarray, shape (3,), north, east, down; ``other`` is a mirrored place that explains as much, or None
     sd, down_sd : with which the estimate begins there, far wider than where it ends; 0 = of a depth as stated [m]
+    placed : north and east are stated, and the depth alone is not
     """
 
     name: str
@@ -243,11 +246,14 @@ class BeaconPlaces:
     other: Array | None
     sd: float
     down_sd: float
+    placed: bool = False
 
     @property
     def text(self) -> str:
         """What is assumed, in a line."""
-        north, east = self.best[:2]
+        north, east, down = self.best
+        if self.placed:
+            return f"beacon {self.name} begins at a depth of {down:.0f} m within {self.down_sd:.0f} m, below the track"
         return (
             f"beacon {self.name} begins where its ranges along dead reckoning put it, north {north:.0f} m, east "
             f"{east:.0f} m, within {self.sd:.0f} m"
@@ -268,7 +274,7 @@ class BeaconPlaces:
 
 
 def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list[BeaconPlaces]:
-    """Places of beacons that the configuration names without one, by ranges along dead reckoning.
+    """Places of beacons that the configuration names without one, or without a depth, by ranges along dead reckoning.
 
     Raises
     ------
@@ -276,17 +282,24 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
     """
     out = []
     for k, beacon in enumerate(initial.config.beacons):
-        if beacon.north_m is not None or "range" not in initial.instruments:
+        if (beacon.north_m is not None and beacon.down_m is not None) or "range" not in initial.instruments:
             continue
         variable = beacon_names(k)[0]
         rows = problem.of_sensor("range")
         rows = rows[problem.contexts(rows)[:, at.BEACON_AT] == LAYOUT[variable].start]
-        if len(rows) < FEWEST:
+        if len(rows) < FEWEST and beacon.north_m is None:
             raise InputError(
                 f"{log.source}: {len(rows)} ranges to beacon {beacon.name}, whose place is unknown; {FEWEST} are "
                 f"needed: state beacons: [{{name: {beacon.name}, north_m: .., east_m: ..}}], or leave it out"
             )
         states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
+        if beacon.north_m is not None and beacon.east_m is not None:
+            down, down_sd = _depth_of_bottom(log, None, states.p_n)
+            place = np.array(
+                [beacon.north_m, beacon.east_m, down + 0.5 * down_sd]
+            )  # from its own depth none tells a side
+            out.append(BeaconPlaces(str(beacon.name), k, place, None, beacon.sd_m, down_sd, True))
+            continue
         there = _interpolated(states, problem.time, problem.rows[rows, at.TIME], {})
         gone = np.linalg.norm(np.diff(states.p_n, axis=0), axis=1)
         way = np.interp(problem.rows[rows, at.TIME], problem.time, np.append(0.0, np.cumsum(gone)))

@@ -283,6 +283,11 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
             p_n[:2] = here - rotate(R_nb, np.asarray(arm))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
             assumptions.append(f"start position from the first {what}, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
+            if start.down_m is None and "depth" not in log and "down" in fixes.columns:
+                p_n[2] = _robust_first(fixes.time, fixes["down"]) - rotate(R_nb, np.asarray(arm))[2]
+                sd[2] = start.down_sd_m or sd[0]
+                assumptions.append(f"start.down_m {p_n[2]:.1f} within {sd[2]:.1f} m, from the first {what}")
+                return p_n, sd
     elif log.origin is not None and not start.located:
         where = f"latitude {log.origin[0]:.6f}, longitude {log.origin[1]:.6f}"
         assumptions.append(f"start at the origin, {where}, within {sd[0]:g} m, as the log has no fix")

@@ -90,7 +90,10 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if b.north_m is None}
+        self._unplaced = {
+            label_number(str(b.name)): str(b.name) for b in config.beacons if None in (b.north_m, b.down_m)
+        }
+        self._only_beacon = len(config.beacons) == 1
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -128,13 +131,17 @@ class Intake:
 
     def _is_unplaced(self, sensor: str, values: Array) -> bool:
         """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
-        named = zip(values.tolist(), self._labels(sensor), strict=False)
-        name = next((self._unplaced[value] for value, label in named if label and value in self._unplaced), None)
+        named = [v for v, label in zip(values.tolist(), self._labels(sensor), strict=False) if label]
+        name = next((self._unplaced[value] for value in named if value in self._unplaced), None)
+        if self._only_beacon and all(math.isnan(value) for value in named):  # needs no name
+            name = next(iter(self._unplaced.values()), None)
         if name is None:
             return False
         why = f"beacon {name} has no place"
         if not self._left_out[sensor, why]:
-            remedy = "rovgraph smooth of the recording finds it; then state north_m, east_m and sd_m under beacons"
+            remedy = (
+                "rovgraph smooth of the recording finds it; then state north_m, east_m, down_m and sds under beacons"
+            )
             self.news.append((sensor, f"{why}, and its ranges are left out: {remedy}"))
         self._left_out[sensor, why] += 1
         return True

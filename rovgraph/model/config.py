@@ -468,6 +468,8 @@ def beliefs(config: Config) -> dict[str, Belief]:
             out[place] = replace(out[place], mean=np.array([beacon.north_m, beacon.east_m]), sd=beacon.sd_m)
         if beacon.down_m is not None:
             out[down] = replace(out[down], mean=np.array([beacon.down_m]), sd=beacon.down_sd_m)
+        elif config.usbl.head == "vehicle":  # whose directions show it
+            out[down] = replace(out[down], sd=out[place].sd)
     return out
 
 

@@ -26,13 +26,14 @@ from rovgraph.model.config import Config, mount_matrix
 from rovgraph.sensors.acoustic import AcousticExchange
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import LARGEST_SD
-from rovgraph.sensors.sound import profile_of
+from rovgraph.sensors.sound import BEYOND_M, profile_of
 
 SHIP = "ship", "ship_heading", "ship_tilt"  # streams
-UNKNOWN_TILT_SD = math.radians(3.0)  # of a ship without ship_roll and ship_pitch, taken as level
+UNKNOWN_TILT_SD = math.radians(3.0)  # where ship_roll and ship_pitch are not known, and the ship is taken as level
 EDGE_SINE = math.sin(math.radians(5.0))  # nearer to its horizon no planar head measures
 DEPTH_GAP_S = 30.0  # over which the vehicle's depth is interpolated for the speed of sound
 TOGETHER_S = 0.02  # within which receivers hear one sound
+BASELINE_S = 1.0  # of the slope with which the ship's motion goes on beyond its log's ends
 REMEMBERED_S = 600.0  # of the ship's motion, online
 Left = Counter[tuple[str, str]]
 
@@ -45,12 +46,14 @@ class Pose(NamedTuple):
     p : its antenna, north and east, shape (k, 2) [m]
     rpy, rates : shape (k, 3), NaN where nothing tells [rad], [rad/s]
     v : shape (k, 2) [m/s]
+    sd : of north and of east as it says, NaN where it does not, shape (k,) [m]
     """
 
     p: Array
     rpy: Array
     v: Array
     rates: Array
+    sd: Array
 
 
 class Heard(NamedTuple):
@@ -113,14 +116,18 @@ class Track:
             if len(self.time):
                 values[np.abs(time - self.time[0]) <= longest] = self.values[0]
             return values, np.zeros_like(values)
-        k = self.time.searchsorted(time).clip(1, len(self.time) - 1)
-        step = (self.time[k] - self.time[k - 1])[:, None]
-        change = self.values[k] - self.values[k - 1]
+        k, last = self.time.searchsorted(time).clip(1, len(self.time) - 1), len(self.time) - 1
+        before, ends = k - 1, self.time[[0, -1]] + [BASELINE_S, -BASELINE_S]  # two neighbours would show their noise
+        after_first, before_last = self.time.searchsorted(ends).clip([1, 0], [last, last - 1])
+        k = np.where(time < self.time[0], after_first, k)
+        before = np.where(time > self.time[-1], before_last, before)
+        step = (self.time[k] - self.time[before])[:, None]
+        change = self.values[k] - self.values[before]
         slope = (wrap_angle(change) if self.angular else change) / np.maximum(step, 1e-6)
-        since = (time - self.time[k - 1])[:, None]
+        since = (time - self.time[before])[:, None]
         reach = np.maximum(0.0, np.maximum(since - step, -since))  # beyond the ends
         known = (reach <= longest) & ((step <= longest) | (since <= 0.0) | (since >= step))
-        values = self.values[k - 1] + slope * since
+        values = self.values[before] + slope * since
         return np.where(known, values, np.nan), np.where(known, slope, np.nan)
 
 
@@ -148,10 +155,10 @@ class Acoustics:
     def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
         self.config = config
         self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, AcousticExchange)}
-        self.tracks = {"ship": Track(2, False), "ship_heading": Track(1, True), "ship_tilt": Track(2, True)}
+        self.tracks = {"ship": Track(3, False), "ship_heading": Track(1, True), "ship_tilt": Track(2, True)}
         ship = config.ship
         if ship.north_m is not None and ship.east_m is not None:
-            self.tracks["ship"].hold(np.array([ship.north_m, ship.east_m]))
+            self.tracks["ship"].hold(np.array([ship.north_m, ship.east_m, math.nan]))
         if ship.heading_deg is not None:
             self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
@@ -173,6 +180,11 @@ class Acoustics:
             if sensor in streams and len(streams[sensor]):
                 self.tracks[sensor].take(streams[sensor].time, streams[sensor].data)
 
+    def take_one(self, m: Measurement) -> None:
+        """Take one measurement of the ship, or of depth, and forget what is long ago."""
+        self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
+        self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
+
     def insert(self, m: Measurement, late: Mapping[str, float], left_out: Left) -> list[Measurement]:
         """Take one of the ship's measurements, or an exchange; those that are complete now.
 
@@ -181,14 +193,14 @@ class Acoustics:
         late : sensor -> how late stamps of exchanges are taken to be [s]
         """
         if m.sensor in self.tracks:
-            self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
-            self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
+            self.take_one(m)
         else:
             self.waiting.append(m)
-        known, out = self._known_until(), []
+        known, out = self._known_until(late), []
         ready = [one for one in self.waiting if one.time - late[one.sensor] + self._lasts(one.sensor) <= known]
         self.waiting = [one for one in self.waiting if all(one is not other for other in ready)]
-        for _, group in groupby(ready, lambda one: (one.sensor, one.time)):
+        ready.sort(key=lambda one: (one.sensor, one.time))  # receivers that hear one sound may stamp it apart
+        for _, group in groupby(ready, lambda one: (one.sensor, one.time if one.sensor == "usbl" else 0.0)):
             some = list(group)
             time, row = (np.array([getattr(one, name) for one in some]) for name in ("time", "row"))
             raw = Stream(some[0].sensor, (), time, np.array([one.values for one in some]), row)
@@ -221,14 +233,16 @@ class Acoustics:
             return None
         return float(place[0]), float(place[1]), math.nan if heading is None else float(heading[0])
 
-    def _known_until(self) -> float:
-        """Up to when all is known of the ship that it has told of so far."""
+    def _known_until(self, late: Mapping[str, float]) -> float:
+        """Up to when all is known of the ship that it has told of so far; what has fallen silent is not waited for."""
         ends = [
             float(self.tracks[sensor].time[-1])
             for sensor in SHIP
             if len(self.tracks[sensor].time) and self.tracks[sensor].held is None
         ]
-        return min(ends, default=math.inf)
+        newest = max([*ends, *(one.time - late[one.sensor] for one in self.waiting)], default=-math.inf)
+        silent = max(self.config.ship.max_gap_s, self.config.graph.lag_s)
+        return min((end for end in ends if end >= newest - silent), default=newest)
 
     # measurements
 
@@ -251,6 +265,7 @@ class Acoustics:
         why: list[tuple[str, NDArray[np.bool_]]] = []
         seen = self._direction(stream.data) if sensor == "usbl" else np.zeros((n, 3))
         length, exact = self._length(stream)
+        why.append(("no length of its way: 0, or a travel time within the turn-around", ~exact))
         names, others = self._others(stream, why)
         c, settings = self._sound_speed(sensor), self._settings(sensor)
         way, wait = length / c, settings.turn_around_s
@@ -360,7 +375,7 @@ class Acoustics:
             why.append(
                 ("another transponder than usbl.beacon", ~np.isnan(label) & (label != label_number(str(stated))))
             )
-        elif len(known) > 1:
+        elif len(known) > 1 and self._transponder is None:
             numbers = [f"{name:.0f}" for name in known.tolist() if name < 2**32]  # beyond are those of texts
             shown = f" ({', '.join(numbers[:6])})" if len(numbers) == len(known) else ""
             raise InputError(
@@ -369,7 +384,12 @@ class Acoustics:
             )
         elif len(known):
             self._transponder = known[0] if self._transponder is None else self._transponder
-            why.append(("another transponder than the first, without usbl.beacon", label != self._transponder))
+            why.append(
+                (
+                    "another transponder than the first, without usbl.beacon",
+                    ~np.isnan(label) & (label != self._transponder),
+                )
+            )
 
     def _place_ends(
         self,
@@ -411,18 +431,16 @@ class Acoustics:
             context[:, at.FRAME : at.FRAME + 9] = R_ns.reshape(n, 9)
             context[:, at.TURNS : at.TURNS + 3] = turn
         elif frame == "ship":
-            level = np.column_stack([np.zeros((n, 2)), rpy[:, 2]])
-            context[:, at.FRAME : at.FRAME + 9] = matrix_from_rpy(level).reshape(n, 9)
+            headed = np.column_stack([np.zeros((n, 2)), rpy[:, 2]])
+            context[:, at.FRAME : at.FRAME + 9] = matrix_from_rpy(headed).reshape(n, 9)
             context[:, at.TURNS + 2] = rates[:, 2]
         for part in (at.ASKED, at.HEARD, at.MOVES, at.TURNS):
             context[~on_ship, part : part + 3] = 0.0
         ship = self.config.ship
-        tilted = self.tracks["ship_tilt"].known
-        sd[:] = (
-            ship.sd_m,
-            math.radians(ship.heading_sd_deg),
-            math.radians(ship.tilt_sd_deg) if tilted or frame != "transducer" else UNKNOWN_TILT_SD,
-        )
+        level = (frame == "transducer") & np.isnan(heard.rpy[:, :2]).any(axis=1)  # taken as level
+        sd[:, 0] = np.where(heard.sd > 0.0, heard.sd, ship.sd_m)
+        sd[:, 1] = math.radians(ship.heading_sd_deg)
+        sd[:, 2] = np.where(level, UNKNOWN_TILT_SD, math.radians(ship.tilt_sd_deg))
         return np.asarray(sd * on_ship[:, None])
 
     def _unbend(self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other]) -> None:
@@ -449,7 +467,8 @@ class Acoustics:
         z[:, 0], context[:, at.SEEN : at.SEEN + 3] = length, rotate(np.swapaxes(R_nf, 1, 2), u_n)
         deepest = float(np.percentile(heard + length * u_n[:, 2], 95))
         if deepest > self._deepest:
-            profile.warn_beyond(deepest if self._deepest == -math.inf else -math.inf)
+            if self._deepest <= profile.depth[-1] + BEYOND_M:
+                profile.warn_beyond(deepest)
             self._deepest = deepest
 
     def _depth_of(self, other: Other) -> float:
@@ -461,13 +480,12 @@ class Acoustics:
 
     def _pose(self, time: Array) -> Pose:
         """The ship at some times."""
-        longest, n = self.config.ship.max_gap_s, len(time)
+        longest = self.config.ship.max_gap_s
         found = {sensor: track.at(time, longest) for sensor, track in self.tracks.items()}
         rpy = np.column_stack([found["ship_tilt"][0], found["ship_heading"][0]])
         rates = np.column_stack([found["ship_tilt"][1], found["ship_heading"][1]])
-        if not self.tracks["ship_tilt"].known:
-            rpy[:, :2] = rates[:, :2] = np.zeros((n, 2))
-        return Pose(found["ship"][0], rpy, found["ship"][1], rates)
+        (place, v) = found["ship"]
+        return Pose(place[:, :2], rpy, v[:, :2], rates, place[:, 2])
 
     def _name_variables(self, sensor: str, context: Array, others: Sequence[Other]) -> None:
         """Write where the calibration variables are into contexts."""

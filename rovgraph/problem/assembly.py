@@ -185,7 +185,7 @@ class Assembly:
         if m.sensor in SHIP or m.sensor in self._acoustics.instruments:
             return self._insert_acoustic(m, settled)
         if m.sensor in self._acoustics.tracks:
-            self._acoustics.tracks[m.sensor].take(np.array([m.time]), m.values[None])
+            self._acoustics.take_one(m)
         return self._insert(m)
 
     def _insert_acoustic(self, m: Measurement, settled: float) -> InsertResult:

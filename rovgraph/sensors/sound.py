@@ -121,7 +121,11 @@ def _read(path: Path) -> SoundSpeedProfile:
     table.columns = [str(name).strip().lower() for name in table.columns]
     if "depth" not in table or not ({"sound_speed"} <= {*table} or {"temperature", "salinity"} <= {*table}):
         raise InputError(f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity")
-    table = table.dropna(subset=["depth"])
+    columns = ["depth", "sound_speed"] if "sound_speed" in table else ["depth", "temperature", "salinity"]
+    try:
+        table = table[columns].dropna().astype(float)
+    except ValueError as error:
+        raise InputError(f"{path}: {', '.join(columns)} are no numbers ({error})") from None
     depth = table["depth"].to_numpy(float)
     if "sound_speed" in table:
         return SoundSpeedProfile(depth, table["sound_speed"].to_numpy(float))
