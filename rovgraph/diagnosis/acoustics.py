@@ -143,7 +143,8 @@ class _LagSearch:
             weight = 1.0 / (1.0 + d2 / TUKEY**2)
         cost = float(0.5 * TUKEY**2 * np.sum(np.log1p(d2 / TUKEY**2)))
         spread = np.maximum(1.0, np.sum(weight * d2) / max(np.sum(weight) * r.shape[1], 1.0))
-        return cost, x, np.sqrt(spread * np.diag(np.linalg.pinv(A.T @ A)))
+        sd = np.sqrt(spread * np.diag(np.linalg.pinv(A.T @ A)))
+        return cost, np.asarray(x, float), np.asarray(sd, float)
 
     def _at(self, lag: float) -> Stream:
         """The replies where the vehicle answered, with a lag."""
