@@ -251,6 +251,11 @@ def test_some_of_a_block_are_its_own_measurements():
     assert [row[0] for row in measurement_keys(some, SEGMENTS[[2, 0]])] == [key("pose", 2), key("pose", 0)]
 
 
+def problem_zeros() -> dict[str, np.ndarray]:
+    """All calibration, which kernels take whole."""
+    return {name: np.zeros(variable.dim) for name, variable in TABLE.items()}
+
+
 def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     """The simulator and the blocks agree about time, motion, lever arms and noise."""
     case = simulated(CONFIG, 40.0, seed=4, ahrs_rate=5.0, fix_interval=1.0, bias=np.zeros(6))
@@ -263,7 +268,7 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     arm = np.array(config.imu.lever_arm_m)
     swing = np.einsum("nij,nj->ni", motion.R_nb, np.cross(motion.w_b, arm))
     p_n, zero = motion.p_n + motion.R_nb @ arm, np.zeros((len(motion), 6))
-    truth = State(motion.R_nb, p_n, motion.v_n + swing, zero, case.dive.hidden["calibration"])
+    truth = State(motion.R_nb, p_n, motion.v_n + swing, zero, {**problem_zeros(), **case.dive.hidden["calibration"]})
     assert set(problem.used) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor in problem.used:
         instrument = smoother.initial.instruments[sensor]

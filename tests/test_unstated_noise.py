@@ -63,6 +63,9 @@ def test_every_sensor_has_an_error_that_lasts():
         "vehicle_compass_error": "vehicle_heading",
         "bottom_velocity": "dvl",
         "depth_error": "depth",
+        "usbl_direction_error": "usbl",
+        "usbl_range_error": "usbl",
+        "range_error": "range",
     }
     assert all(np.isfinite(TABLE[name].time_constant) for name in LASTING)
 

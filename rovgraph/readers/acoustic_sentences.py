@@ -178,7 +178,7 @@ def require_whole(text: str, bare: bool = False) -> None:
     ------
     Refused : its checksum is wrong or missing
     """
-    body, star, stated = text.strip().removeprefix("$").partition("*")
+    body, star, stated = text.strip().removeprefix("$").rpartition("*")
     total = 0
     for byte in body.encode("ascii", "replace"):
         total ^= byte

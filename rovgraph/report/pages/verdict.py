@@ -48,6 +48,11 @@ CAUSES = (
         "take a position fix at the start, or state start.position_sd_m where it is known better",
         known=True,
     ),
+    Cause(
+        ("usbl", "range", "ship", "sound_speed", "beacon"),
+        "the acoustic positioning (noise, alignment, beacons)",
+        "move beside the ship or round the beacon, so that the alignment shows, or state usbl and range more precisely",
+    ),
     Cause(("fix",), "the position fixes", "take better fixes, or state fix.sd_m where they are better", known=True),
     Cause(
         HEADING,
