@@ -34,14 +34,6 @@ AXES = {
     "transducer": "forward, starboard, down of the head",
 }
 LAST = ("PTSAH", "PSONALL")  # of attitudes
-INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter turns them into PTSAG with what it knows of the ship
-BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
-AXES = {
-    "ship": "forward, starboard, down of the ship made level",
-    "north": "north, east, down by the ship's compass",
-    "transducer": "forward, starboard, down of the head",
-}
-LAST = ("PTSAH", "PSONALL")  # of attitudes
 INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter makes PTSAG of them with what it knows of the ship
 BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
 NAMES = ("PSIM", "PTSA", "PSON", "USRTH", "USBL", "MicronNav", "SeaTrac")  # of acoustic sentences
