@@ -681,6 +681,8 @@ def _place_of_more(text: bytes, names: Sequence[str], odd: _Odd, layout: CellLay
             raise wrong
         return len(names), more
     before, after = (_cells(line, layout.separator) for line in rows[:2])
+    if len(before) + more != len(after):  # a name of the header goes over two lines
+        raise wrong
     likeness = [
         sum(_alike(a, b) for a, b in zip(before, [*after[:k], *after[k + more :]], strict=True))
         for k in range(len(names) + 1)
