@@ -144,6 +144,20 @@ def rpy_jacobian(rpy: ArrayLike) -> Array:
     return J
 
 
+def rpy_axes(rpy: Array) -> Array:
+    """The inverse of `rpy_jacobian`: axes in n that roll, pitch and yaw turn about, as columns, shape (n, 3, 3).
+
+    Parameters
+    ----------
+    rpy : ndarray, shape (n, 3)
+    """
+    cp, sp = np.cos(rpy[:, 1]), np.sin(rpy[:, 1])
+    cy, sy = np.cos(rpy[:, 2]), np.sin(rpy[:, 2])
+    zero, one = np.zeros_like(cy), np.ones_like(cy)
+    axes = [[cp * cy, cp * sy, -sp], [-sy, cy, zero], [zero, zero, one]]
+    return np.moveaxis(np.array(axes), -1, 0).swapaxes(-1, -2)
+
+
 def exp_rotation(rotvec: ArrayLike) -> Array:
     """Rotation matrices Exp(rotvec), Rodrigues' formula (2.1).
 

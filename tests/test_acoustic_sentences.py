@@ -23,8 +23,8 @@ from rovgraph.log.streams import STREAMS, label_number
 from rovgraph.model.config import Config
 from rovgraph.readers.acoustic_channels import from_utm, on_ships_grid
 from rovgraph.readers.acoustic_sentences import (
-    Directions,
-    Position,
+    AcousticPosition,
+    HeadDirections,
     Reply,
     ShipAttitude,
     Told,
@@ -79,7 +79,7 @@ def test_axes_of_a_reply(axes, frame, xy):
 
 def test_degrees_move_the_later_fields_by_two():
     found = told(sentence("PSIMSSB,120000.00,B01,A,,D,N,M,5030.0000,N,00130.0000,W,24.8,1.4,N,,"))
-    assert isinstance(found, Position)
+    assert isinstance(found, AcousticPosition)
     assert (found.lat, found.lon, found.sd) == (50.5, -1.5, 1.4)
 
 
@@ -144,12 +144,12 @@ def test_appended_fields_change_nothing():
 
 def test_a_printed_position_of_a_gaps():
     found = told("$PTSAG,#16068,124544.449,18,12,2017,1,4305.25355,N,00631.76852,E,F,1013.10,1,9999.00*23")
-    assert isinstance(found, Position)
+    assert isinstance(found, AcousticPosition)
     close([found.lat, found.lon], [43.0 + 5.25355 / 60, 6.0 + 31.76852 / 60], atol=1e-9)
     assert (found.name, found.of_ship) == ("PTSAG 1", False)
     assert found.when.sent == datetime(2017, 12, 18, 12, 45, 44, 449000, UTC).timestamp()
     ship = told("$PTSAG,#16071,124546.173,18,12,2017,0,4305.25123,N,00631.79102,E,F,0002.89,1,9999.00*25")
-    assert isinstance(ship, Position) and ship.of_ship
+    assert isinstance(ship, AcousticPosition) and ship.of_ship
 
 
 def test_a_printed_relative_position_is_forward_and_starboard():
@@ -174,7 +174,7 @@ def test_three_hydrophones_of_a_gaps_are_enough(id_, mask, said):
     if said:
         assert said in refused(line)
     else:
-        assert isinstance(told(line), Position)
+        assert isinstance(told(line), AcousticPosition)
 
 
 def test_the_old_form_of_a_gaps_is_refused():
@@ -197,7 +197,7 @@ def test_the_old_form_of_a_gaps_is_refused():
 )  # fmt: skip
 def test_real_positions_of_a_ranger(line, name, lat, lon, sd, ship):
     found = told(line)
-    assert isinstance(found, Position)
+    assert isinstance(found, AcousticPosition)
     assert (found.name, found.lat, found.lon, found.of_ship) == (name, lat, lon, ship)
     assert found.sd == pytest.approx(sd)
 
@@ -206,7 +206,7 @@ def test_eastings_and_northings_need_the_ship():
     ship = told("$PSONALL,Ship 1,CRP,134446.175,650879.00,5688874.16,0.00,180.00,,G,0.00,0.00,,0.109,0.001*51")
     assert isinstance(ship, ShipAttitude) and ship.heading == math.pi
     found = told("$PSONALL,2401,Transducer,134446.178,650778.88,5688917.56,1000.09,,,G,,,,7.521,0.606*3F")
-    assert isinstance(found, Position)
+    assert isinstance(found, AcousticPosition)
     assert (found.grid, found.sd) == ((650778.88, 5688917.56), 7.521)
     near = on_ships_grid(found.grid, 51.33, -0.83)  # zone 30
     assert near is not None
@@ -283,7 +283,7 @@ def test_modems_directions_go_with_their_ranges():
         "0.0000,9377,-54,106,0.1698"
     )
     angles = "USBLANGLES,1464207778.381,1464207778.075953,2,0.2,0.1,0.2,0.1,0,0,0,-54,106,0.0121"
-    pairs = Directions()
+    pairs = HeadDirections()
     assert pairs.joined(reply(angles)) is None
     joined = pairs.joined(reply(long))
     assert joined is not None

@@ -153,14 +153,14 @@ def test_replies_without_a_ship_near_are_counted_and_left_out():
 
 def test_a_ship_that_says_no_tilt_any_more_makes_directions_less_precise():
     found = acoustics_of(parse_config(""))
-    found.tracks["ship_tilt"].time, found.tracks["ship_tilt"].values = np.arange(2.0), np.zeros((2, 2))
+    found.signals["ship_tilt"].time, found.signals["ship_tilt"].values = np.arange(2.0), np.zeros((2, 2))
     near, far = (found.exchanges(reply(t, 150.0, 0.3, 0.8), 0.0, Counter()).data[0, 4] for t in (3.0, 15.0))
     assert far**2 - near**2 == pytest.approx(np.radians(3.0) ** 2 - np.radians(0.1) ** 2)
 
 
 def test_the_ships_own_sd_takes_precedence():
     found = acoustics_of(parse_config("{ship: {sd_m: 0.1}, usbl: {range_sd_m: 0.3}}"))
-    found.tracks["ship"].values[10:, 2] = 5.0
+    found.signals["ship"].values[10:, 2] = 5.0
     sds = [found.exchanges(reply(t, 15.0, 0.3, 0.8), 0.0, Counter()).data[0, 3] for t in (3.0, 15.0)]
     np.testing.assert_allclose(sds, np.hypot(0.3, [0.1, 5.0]))
 
@@ -168,9 +168,9 @@ def test_the_ships_own_sd_takes_precedence():
 def test_beyond_the_end_of_its_log_the_ship_goes_on_smoothly():
     found, t = Acoustics(Config(), {}), np.arange(0.0, 20.0, 0.1)
     noise = 0.1 * np.where(np.arange(len(t)) % 2, 1.0, -1.0)
-    found.tracks["ship"].take(t, np.column_stack([2.0 * t + noise, noise, noise]))
+    found.signals["ship"].take(t, np.column_stack([2.0 * t + noise, noise, noise]))
     for end in (-2.0, 22.0):
-        assert found.tracks["ship"].at(np.array([end]), 3.0)[0][0, 0] == pytest.approx(2.0 * end, abs=0.8)
+        assert found.signals["ship"].at(np.array([end]), 3.0)[0][0, 0] == pytest.approx(2.0 * end, abs=0.8)
 
 
 def test_replies_without_a_length_are_left_out():

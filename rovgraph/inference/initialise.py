@@ -36,7 +36,7 @@ from rovgraph.log.frozen import CLEAR_SPEED
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.state import POSE, Jacobians, State
-from rovgraph.problem.acoustics import rough_positions, unusable_acoustics
+from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
@@ -308,7 +308,8 @@ def _positions(log: Log, config: Config) -> tuple[Stream | None, Sequence[float]
         return log["fix"], config.fix.lever_arm_m, "fix"
     acoustic = None
     if "usbl" in log and "usbl" not in unusable_acoustics(config, log.sensors):
-        acoustic = rough_positions(log, config, instruments(config))
+        found = sightings(log, config, instruments(config))
+        acoustic = None if found is None else found.positions
     return acoustic, config.usbl.beacon_arm_m, "acoustic position"
 
 

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from rovgraph.dates import YEAR_FIRST, DateRules, Moments, is_unix, seconds_of_moments
 from rovgraph.errors import InputError, as_path, warn
-from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
+from rovgraph.geometry import (
+    Array,
+    matrix_from_rpy,
+    quaternion_from_matrix,
+    rpy_axes,
+    rpy_from_matrix,
+    rpy_jacobian,
+    transpose,
+)
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
 
@@ -377,16 +385,7 @@ def parse_trajectory(table: pd.DataFrame, source: str) -> Trajectory:
     rpy, cov_p = take(ATTITUDE), diagonal(POSITION)
     if "cov_north_east" in frame:
         cov_p[:, 0, 1] = cov_p[:, 1, 0] = frame["cov_north_east"]
-    axes = _rpy_axes(rpy)
+    axes = rpy_axes(rpy)
     cov_theta = axes @ diagonal(ATTITUDE) @ transpose(axes)
     R_nb = matrix_from_rpy(rpy)
     return Trajectory(time, take(POSITION), R_nb, take(VELOCITY), cov_p, cov_theta, diagonal(VELOCITY))
-
-
-def _rpy_axes(rpy: Array) -> Array:
-    """The inverse of `rpy_jacobian`: axes in n that roll, pitch and yaw turn about, as columns."""
-    cp, sp = np.cos(rpy[:, 1]), np.sin(rpy[:, 1])
-    cy, sy = np.cos(rpy[:, 2]), np.sin(rpy[:, 2])
-    zero, one = np.zeros_like(cy), np.ones_like(cy)
-    axes = [[cp * cy, cp * sy, -sp], [-sy, cy, zero], [zero, zero, one]]
-    return np.moveaxis(np.array(axes), -1, 0).swapaxes(-1, -2)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
+from rovgraph.geometry import Array, matrix_from_rpy, rotate, rpy_axes, transpose, wrap_angle
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import label_number
@@ -56,7 +56,7 @@ class Pose(NamedTuple):
     sd: Array
 
 
-class Heard(NamedTuple):
+class NewestRange(NamedTuple):
     """The newest range to another end, online.
 
     Attributes
@@ -73,7 +73,7 @@ class Heard(NamedTuple):
     length: float
 
 
-class Track:
+class ShipSignal:
     """Values of a stream of the ship that grows, interpolated."""
 
     def __init__(self, width: int, angular: bool) -> None:
@@ -155,19 +155,23 @@ class Acoustics:
     def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
         self.config = config
         self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, AcousticExchange)}
-        self.tracks = {"ship": Track(3, False), "ship_heading": Track(1, True), "ship_tilt": Track(2, True)}
+        self.signals = {
+            "ship": ShipSignal(3, False),
+            "ship_heading": ShipSignal(1, True),
+            "ship_tilt": ShipSignal(2, True),
+        }
         ship = config.ship
         if ship.north_m is not None and ship.east_m is not None:
-            self.tracks["ship"].hold(np.array([ship.north_m, ship.east_m, math.nan]))
+            self.signals["ship"].hold(np.array([ship.north_m, ship.east_m, math.nan]))
         if ship.heading_deg is not None:
-            self.tracks["ship_heading"].hold(np.radians([ship.heading_deg]))
+            self.signals["ship_heading"].hold(np.radians([ship.heading_deg]))
         self.waiting: list[Measurement] = []
-        self.heard: dict[int, Heard] = {}
+        self.heard: dict[int, NewestRange] = {}
         self._transponder: float | None = None  # that has answered
         self.since: dict[str, float] = {}  # sensor -> time of its first exchange, from which a clock drifts [s]
         self._profile = profile_of(config.sound.profile)
         if self._profile is not None:
-            self.tracks["depth"] = Track(1, False)  # of the vehicle, where ranges are made with the speed between
+            self.signals["depth"] = ShipSignal(1, False)  # of the vehicle, where ranges are made with the speed between
         self._deepest = -math.inf
         self._places = {label_number(str(beacon.name)): k for k, beacon in enumerate(config.beacons)}
         self._receivers = {label_number(name): np.array(arm) for name, arm in config.ship.receivers.items()}
@@ -176,14 +180,14 @@ class Acoustics:
 
     def take_ship(self, streams: Mapping[str, Stream]) -> None:
         """What a log has of the ship, and of depth where that counts."""
-        for sensor in self.tracks:
+        for sensor in self.signals:
             if sensor in streams and len(streams[sensor]):
-                self.tracks[sensor].take(streams[sensor].time, streams[sensor].data)
+                self.signals[sensor].take(streams[sensor].time, streams[sensor].data)
 
     def take_one(self, m: Measurement) -> None:
         """Take one measurement of the ship, or of depth, and forget what is long ago."""
-        self.tracks[m.sensor].take(np.array([m.time]), m.values[None])
-        self.tracks[m.sensor].forget(m.time - REMEMBERED_S)
+        self.signals[m.sensor].take(np.array([m.time]), m.values[None])
+        self.signals[m.sensor].forget(m.time - REMEMBERED_S)
 
     def insert(self, m: Measurement, late: Mapping[str, float], left_out: Left) -> list[Measurement]:
         """Take one of the ship's measurements, or an exchange; those that are complete now.
@@ -192,7 +196,7 @@ class Acoustics:
         ----------
         late : sensor -> how late stamps of exchanges are taken to be [s]
         """
-        if m.sensor in self.tracks:
+        if m.sensor in self.signals:
             self.take_one(m)
         else:
             self.waiting.append(m)
@@ -224,11 +228,11 @@ class Acoustics:
             context = values[skipped:]
             north, east, down = context[at.HEARD : at.HEARD + 3]
             beacon = ends.get(int(context[at.BEACON_AT]), -1)
-            self.heard = {**self.heard, beacon: Heard(time, beacon, (north, east, down), values[0])}
+            self.heard = {**self.heard, beacon: NewestRange(time, beacon, (north, east, down), values[0])}
 
     def ship(self) -> tuple[float, float, float] | None:
         """North and east of the ship [m] and its heading [rad], NaN without one, as newest known; None = not known."""
-        place, heading = self.tracks["ship"].newest, self.tracks["ship_heading"].newest
+        place, heading = self.signals["ship"].newest, self.signals["ship_heading"].newest
         if place is None:
             return None
         return float(place[0]), float(place[1]), math.nan if heading is None else float(heading[0])
@@ -236,9 +240,9 @@ class Acoustics:
     def _known_until(self, late: Mapping[str, float]) -> float:
         """Up to when all is known of the ship that it has told of so far; what has fallen silent is not waited for."""
         ends = [
-            float(self.tracks[sensor].time[-1])
+            float(self.signals[sensor].time[-1])
             for sensor in SHIP
-            if len(self.tracks[sensor].time) and self.tracks[sensor].held is None
+            if len(self.signals[sensor].time) and self.signals[sensor].held is None
         ]
         newest = max([*ends, *(one.time - late[one.sensor] for one in self.waiting)], default=-math.inf)
         silent = max(self.config.ship.max_gap_s, self.config.graph.lag_s)
@@ -424,7 +428,7 @@ class Acoustics:
         rpy, rates = np.nan_to_num(heard.rpy), np.nan_to_num(heard.rates)
         velocity = np.column_stack([np.nan_to_num(heard.v), np.zeros(n)])
         R_ns = matrix_from_rpy(rpy)
-        turn = _turn_rate(rpy, rates)
+        turn = rotate(transpose(R_ns), rotate(rpy_axes(rpy), rates))  # in the ship's axes
         velocity += rotate(R_ns, np.cross(turn, arms - np.array(self.config.ship.antenna_m)))
         context[:, at.MOVES : at.MOVES + 3] = velocity
         if frame == "transducer":
@@ -451,7 +455,7 @@ class Acoustics:
         heard = context[:, at.HEARD + 2]
         if sensor != "usbl" or self.config.usbl.head == "vehicle":
             lower = np.array([self._depth_of(other) for other in others])
-            vehicle = np.nan_to_num(self.tracks["depth"].at(time, DEPTH_GAP_S)[0][:, 0])
+            vehicle = np.nan_to_num(self.signals["depth"].at(time, DEPTH_GAP_S)[0][:, 0])
             z[:, 0] *= profile.mean(vehicle, np.where(np.isnan(lower), profile.depth[-1], lower)) / believed
             return
         R_nf = context[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(self.config.usbl.mount_rpy_deg)
@@ -464,7 +468,7 @@ class Acoustics:
         turned = np.column_stack([u_n[:, :2] / np.maximum(level, 1e-9)[:, None] * across[:, None], down])
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
         u_n = np.where(straight[:, None], u_n, turned)
-        z[:, 0], context[:, at.SEEN : at.SEEN + 3] = length, rotate(np.swapaxes(R_nf, 1, 2), u_n)
+        z[:, 0], context[:, at.SEEN : at.SEEN + 3] = length, rotate(transpose(R_nf), u_n)
         deepest = float(np.percentile(heard + length * u_n[:, 2], 95))
         if deepest > self._deepest:
             if self._deepest <= profile.depth[-1] + BEYOND_M:
@@ -481,7 +485,7 @@ class Acoustics:
     def _pose(self, time: Array) -> Pose:
         """The ship at some times."""
         longest = self.config.ship.max_gap_s
-        found = {sensor: track.at(time, longest) for sensor, track in self.tracks.items()}
+        found = {sensor: signal.at(time, longest) for sensor, signal in self.signals.items()}
         rpy = np.column_stack([found["ship_tilt"][0], found["ship_heading"][0]])
         rates = np.column_stack([found["ship_tilt"][1], found["ship_heading"][1]])
         (place, v) = found["ship"]
@@ -497,7 +501,7 @@ class Acoustics:
             "",
             "",
             "sound_speed_scale",
-            f"{sensor}_range_offset" if sensor == "usbl" else "range_offset",
+            "usbl_range_offset" if sensor == "usbl" else "range_offset",
             "range_clock",
             "range_clock_drift",
             *lasting,
@@ -563,7 +567,7 @@ class Acoustics:
         """One that goes on by itself from here."""
         twin = copy(self)
         twin.since = dict(self.since)
-        twin.tracks, twin.waiting = {sensor: copy(track) for sensor, track in self.tracks.items()}, self.waiting[:]
+        twin.signals, twin.waiting = {sensor: copy(signal) for sensor, signal in self.signals.items()}, self.waiting[:]
         return twin
 
     def state(self) -> dict[str, Any]:
@@ -571,8 +575,8 @@ class Acoustics:
         return {
             "since": dict(self.since),
             "transponder": math.nan if self._transponder is None else self._transponder,
-            **{f"{sensor}_time": track.time for sensor, track in self.tracks.items()},
-            **{f"{sensor}_values": track.values for sensor, track in self.tracks.items()},
+            **{f"{sensor}_time": signal.time for sensor, signal in self.signals.items()},
+            **{f"{sensor}_values": signal.values for sensor, signal in self.signals.items()},
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -580,30 +584,13 @@ class Acoustics:
         self.since = {str(sensor): float(time) for sensor, time in state["since"].items()}
         known = float(state["transponder"])
         self._transponder = None if math.isnan(known) else known
-        for sensor, track in self.tracks.items():
-            track.time = np.array(state[f"{sensor}_time"], float)
-            track.values = np.array(state[f"{sensor}_values"], float).reshape(-1, track.width)
-
-
-def _turn_rate(rpy: Array, rates: Array) -> Array:
-    """Angular rate in the ship's axes of rates of roll, pitch and yaw, shape (n, 3) [rad/s]."""
-    sr, cr = np.sin(rpy[:, 0]), np.cos(rpy[:, 0])
-    sp, cp = np.sin(rpy[:, 1]), np.cos(rpy[:, 1])
-    roll, pitch, yaw = rates.T
-    return np.column_stack([roll - yaw * sp, pitch * cr + yaw * sr * cp, yaw * cr * cp - pitch * sr])
-
-
-def rough_positions(log: Log, config: Config, instruments: Mapping[str, Instrument]) -> Stream | None:
-    """Where acoustic directions and ranges put the vehicle by themselves: north, east, down and sd [m].
-
-    Of a head on the ship, by its nominal mounting; to begin with, to search with and to draw.
-    """
-    found = sightings(log, config, instruments)
-    return None if found is None else found.positions
+        for sensor, signal in self.signals.items():
+            signal.time = np.array(state[f"{sensor}_time"], float)
+            signal.values = np.array(state[f"{sensor}_values"], float).reshape(-1, signal.width)
 
 
 class Sightings(NamedTuple):
-    """Where acoustic directions and ranges put the vehicle by themselves.
+    """Where acoustic directions and ranges put the vehicle by themselves, by the head's nominal mounting.
 
     Attributes
     ----------
@@ -616,7 +603,7 @@ class Sightings(NamedTuple):
 
 
 def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], late: float = 0.0) -> Sightings | None:
-    """Positions as `rough_positions` has them, of replies whose stamps are late [s]; None without a head on the ship.
+    """To begin with, to search with and to draw: of replies whose stamps are late [s]; None without a head on the ship.
 
     Raises
     ------

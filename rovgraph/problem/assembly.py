@@ -184,7 +184,7 @@ class Assembly:
             return InsertResult.IN if self._no_imu else self._insert_sample(m.time, m.values[:6], m.row)
         if m.sensor in SHIP or m.sensor in self._acoustics.instruments:
             return self._insert_acoustic(m, settled)
-        if m.sensor in self._acoustics.tracks:
+        if m.sensor in self._acoustics.signals:
             self._acoustics.take_one(m)
         return self._insert(m)
 

@@ -19,7 +19,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.disk_columns import median_step
 from rovgraph.log.streams import label_number
-from rovgraph.readers.acoustic_sentences import Position, Reply, ShipAttitude, Told
+from rovgraph.readers.acoustic_sentences import AcousticPosition, Reply, ShipAttitude, Told
 from rovgraph.readers.nmea_sentences import TRUE
 from rovgraph.readers.recording import Channel, Clock, preferred_first
 from rovgraph.sensors import SENSORS
@@ -148,18 +148,18 @@ class Heard:
     Attributes
     ----------
     replies : (kind, frame) -> time, Reply
-    positions : name -> time, Position
+    positions : name -> time, AcousticPosition
     attitudes : kind -> time, ShipAttitude
     """
 
     replies: dict[tuple[str, str], list[tuple[float, Reply]]] = field(default_factory=dict)
-    positions: dict[str, list[tuple[float, Position]]] = field(default_factory=dict)
+    positions: dict[str, list[tuple[float, AcousticPosition]]] = field(default_factory=dict)
     attitudes: dict[str, list[tuple[float, ShipAttitude]]] = field(default_factory=dict)
 
     def add(self, time: float, told: Told) -> None:
         if isinstance(told, Reply):
             self.replies.setdefault((told.kind, told.frame), []).append((time, told))
-        elif isinstance(told, Position):
+        elif isinstance(told, AcousticPosition):
             self.positions.setdefault(told.name, []).append((time, told))
         else:
             self.attitudes.setdefault(told.kind, []).append((time, told))
@@ -170,7 +170,7 @@ class Heard:
         return [name for name, _ in Counter(r.name for of in self.replies.values() for _, r in of).most_common()]
 
 
-class Group(NamedTuple):
+class RepliesAlongAxes(NamedTuple):
     """Replies along the same axes.
 
     Attributes
@@ -305,7 +305,7 @@ class ShipsFile:
 
     # relative to the ship, as measured
 
-    def _raw(self, direct: Mapping[str, Channel]) -> list[Group]:
+    def _raw(self, direct: Mapping[str, Channel]) -> list[RepliesAlongAxes]:
         """Groups of replies to be read as they were measured, the preferred one first; [] = they are to be fixes."""
         wanted = self.choose.get("usbl")
         if wanted is None and (self.ship is None or "fix" in self.choose):
@@ -319,9 +319,9 @@ class ShipsFile:
                 known = self.ship.knows(np.array([t for t, _ in measured]), frame != "north")
                 used = [row for row, k in zip(measured, known.tolist(), strict=True) if k]
             if used and (wanted is not None or 2 * len(measured) >= len(rows)):
-                groups.append(Group(kind, frame, used, len(rows) - len(used)))
+                groups.append(RepliesAlongAxes(kind, frame, used, len(rows) - len(used)))
 
-        def rank(group: Group) -> tuple[bool, bool, bool, int]:
+        def rank(group: RepliesAlongAxes) -> tuple[bool, bool, bool, int]:
             unwanted = wanted is not None and first[0] not in {reply.name for _, reply in group.used}
             return unwanted, group.kind in INERTIAL, group.frame == "north", -len(group.used)
 
@@ -329,7 +329,7 @@ class ShipsFile:
         return [] if direct and wanted is None and groups and groups[0].kind in INERTIAL else groups
 
     def _as_measured(
-        self, groups: Sequence[Group], direct: Mapping[str, Channel]
+        self, groups: Sequence[RepliesAlongAxes], direct: Mapping[str, Channel]
     ) -> tuple[list[Channel], dict[str, Any]]:
         """Channels of replies, of the ship's positions and attitudes."""
         for group in groups:
@@ -366,7 +366,7 @@ class ShipsFile:
         ]
         return [*raw, *ships, *self.headings, *self.tilts], {"usbl": settings}
 
-    def _usbl(self, group: Group, names: Sequence[str]) -> Channel:
+    def _usbl(self, group: RepliesAlongAxes, names: Sequence[str]) -> Channel:
         """The channel of replies along the same axes."""
         of_log = [name for name in SENSORS["usbl"].column_names if name != "usbl_beacon"]
         filled = [name for name in of_log if any(name in reply.columns for _, reply in group.used)]
@@ -436,7 +436,7 @@ class ShipsFile:
         return made
 
 
-def _fixes(rows: Iterable[tuple[float, Position]]) -> dict[str, Array]:
+def _fixes(rows: Iterable[tuple[float, AcousticPosition]]) -> dict[str, Array]:
     return _in_time(((t, (p.lat, p.lon, p.sd)) for t, p in rows), ("fix_lat", "fix_lon", "fix_sd"))
 
 

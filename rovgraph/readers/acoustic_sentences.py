@@ -125,7 +125,7 @@ class Reply:
 
 
 @dataclass(frozen=True)
-class Position:
+class AcousticPosition:
     """Where a transponder, or the ship, is on Earth.
 
     Attributes
@@ -163,7 +163,7 @@ class ShipAttitude:
     pitch: float = math.nan
 
 
-Told = Reply | Position | ShipAttitude
+Told = Reply | AcousticPosition | ShipAttitude
 Cells = Sequence[str]  # the name, then the fields; empty beyond them
 
 
@@ -316,10 +316,10 @@ def _psimssb(cells: Cells) -> Told:
     when, smoothed = _when(clock, HALF_HOUR_S), filtered == "F"
     if system == "D":
         lat, lon = _degrees(cells[8], cells[9], 90.0), _degrees(cells[10], cells[11], 180.0)
-        return Position(kind, beacon, when, lat, lon, _accuracy(cells[13]), filtered=smoothed)
+        return AcousticPosition(kind, beacon, when, lat, lon, _accuracy(cells[13]), filtered=smoothed)
     if system == "U":
         x, y = _numbers(cells, 8, 9)
-        return Position(kind, beacon, when, math.nan, math.nan, _accuracy(cells[11]), (x, y), filtered=smoothed)
+        return AcousticPosition(kind, beacon, when, math.nan, math.nan, _accuracy(cells[11]), (x, y), filtered=smoothed)
     if system != "C":
         raise Refused(NO_POSITION, "neither in Cartesian coordinates relative to a ship nor in degrees")
     x, y, depth = _numbers(cells, 8, 9, 10)
@@ -340,7 +340,7 @@ def _psimlbp(cells: Cells) -> Told:
         raise Refused(NO_POSITION, "the system marks it as not OK")
     x, y = _numbers(cells, 6, 7)
     sd = _ellipse_sd(cells[9], cells[10])
-    return Position(cells[0], cells[2], _when(cells[1], HALF_HOUR_S), math.nan, math.nan, sd, (x, y))
+    return AcousticPosition(cells[0], cells[2], _when(cells[1], HALF_HOUR_S), math.nan, math.nan, sd, (x, y))
 
 
 # iXblue GAPS
@@ -380,7 +380,7 @@ def _ptsag(cells: Cells) -> Told:
     if beacon != "0":
         _require_heard(cells[11])
     lat, lon = _degrees(cells[7], cells[8], 90.0), _degrees(cells[9], cells[10], 180.0)
-    return Position(cells[0], beacon, when, lat, lon, of_ship=beacon == "0")
+    return AcousticPosition(cells[0], beacon, when, lat, lon, of_ship=beacon == "0")
 
 
 def _ptsa_relative(cells: Cells) -> Told:
@@ -410,7 +410,7 @@ def _psonlld(cells: Cells) -> Told:
         raise Refused(NO_POSITION, "the system marks it as not OK")
     lat, lon = _on_earth(*_numbers(cells, 4, 5))
     sd = _ellipse_sd(cells[7], cells[8])
-    return Position(kind, beacon.strip(), _when(clock), lat, lon, sd, of_ship=_of_ship(beacon))
+    return AcousticPosition(kind, beacon.strip(), _when(clock), lat, lon, sd, of_ship=_of_ship(beacon))
 
 
 def _psonall(cells: Cells) -> Told:
@@ -420,7 +420,7 @@ def _psonall(cells: Cells) -> Told:
         return ShipAttitude(kind, when, _heading(cells[7]), _angle(cells[11]), _angle(cells[10]))
     east, north = _numbers(cells, 4, 5)
     sd = number(cells[13])
-    return Position(kind, beacon, when, math.nan, math.nan, math.nan if sd is None else sd, (east, north))
+    return AcousticPosition(kind, beacon, when, math.nan, math.nan, math.nan if sd is None else sd, (east, north))
 
 
 # Cerulean ROVL, EvoLogics S2C, Tritech MicronNav
@@ -616,7 +616,7 @@ def _cells(text: str) -> list[str]:
     return [*text.partition("*")[0].strip().split(","), *[""] * _MOST_FIELDS]
 
 
-class Directions:
+class HeadDirections:
     """Puts directions (``USBLANGLES``) to the ranges that they were measured with (``USBLLONG``)."""
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log.stamps import DAY_S
 from rovgraph.readers.acoustic_channels import Heard, ShipsFile
-from rovgraph.readers.acoustic_sentences import Directions, Reply, Told, When, acoustic_sentence, told_by
+from rovgraph.readers.acoustic_sentences import HeadDirections, Reply, Told, When, acoustic_sentence, told_by
 from rovgraph.readers.formats import HEAD, ReadingOptions
 from rovgraph.readers.nmea_sentences import (
     ATTITUDES,
@@ -108,7 +108,7 @@ class _Sentences:
         self._spare = {DAY: array("d"), MODEM: array("d")}  # the same by acoustic sentences, which are late
         self._rows: dict[tuple[str, str], array[float]] = {}  # sensor and name -> place, values
         self._told: list[tuple[int, Told]] = []  # place, by acoustic sentences
-        self._directions = Directions()
+        self._directions = HeadDirections()
         self._left: Counter[tuple[str, str]] = Counter()
         self._variation: list[float] = []
         self._place = 0

@@ -180,12 +180,12 @@ class AcousticSampler:
         out = Acoustics(config.model_copy(update={"ship": sure, "usbl": usbl}), self.instruments)
         time = np.arange(0.0, self.ship.duration + TRACK_S, TRACK_S).clip(max=self.ship.duration)
         if ship.north_m is None:
-            out.tracks["ship"].take(time, self._antenna(time))
+            out.signals["ship"].take(time, np.column_stack([self._antenna(time), np.full(len(time), np.nan)]))
         if ship.heading_deg is None:
-            out.tracks["ship_heading"].take(time, self._attitude(time)[:, 2:])
-            out.tracks["ship_tilt"].take(time, self._attitude(time)[:, :2])
-        if "depth" in out.tracks:
-            out.tracks["depth"].take(time, self.epochs(time)[0].p_n[:, 2:])
+            out.signals["ship_heading"].take(time, self._attitude(time)[:, 2:])
+            out.signals["ship_tilt"].take(time, self._attitude(time)[:, :2])
+        if "depth" in out.signals:
+            out.signals["depth"].take(time, self.epochs(time)[0].p_n[:, 2:])
         return out
 
     def _table(

@@ -23,8 +23,8 @@ from rovgraph.log.streams import label_number
 from rovgraph.model.config import Config
 from rovgraph.readers.acoustic_channels import INERTIAL, NO_GRID, Ship, on_ships_grid, positions
 from rovgraph.readers.acoustic_sentences import (
-    Directions,
-    Position,
+    AcousticPosition,
+    HeadDirections,
     Reply,
     ShipAttitude,
     Told,
@@ -93,7 +93,7 @@ class NmeaDecoder:
         self._of_ship = config.usbl != nothing.usbl or config.ship != nothing.ship
         self._ship: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)  # time, latitude, longitude
         self._pointing: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # time, heading
-        self._directions = Directions()
+        self._directions = HeadDirections()
         self._read: dict[str, Callable[[Any, float], Reading | None]] = {
             **dict.fromkeys(HEADINGS, self._heading),
             **dict.fromkeys(FIXES, self._fix),
@@ -188,11 +188,11 @@ class NmeaDecoder:
         if isinstance(told, ShipAttitude):
             taken = self._headings.takes(told.kind, time)
             return self._attitude_of_ship(told.heading, told.roll, told.pitch, time) if taken else ()
-        if isinstance(told, Position) and told.of_ship:
+        if isinstance(told, AcousticPosition) and told.of_ship:
             if not self._fixes.takes(told.kind, time) or not math.isfinite(told.lat):
                 return ()
             return self._of_the_ship(Reading(GEODETIC, np.array([told.lat, told.lon, told.sd])), time)
-        if isinstance(told, Position):
+        if isinstance(told, AcousticPosition):
             return self._position(told, time)
         joined = self._directions.joined(told)
         return () if joined is None else self._reply(joined, time)
@@ -204,7 +204,7 @@ class NmeaDecoder:
         self._beacon = self._beacon or beacon
         return beacon == self._beacon
 
-    def _position(self, told: Position, time: float) -> tuple[Reading, ...]:
+    def _position(self, told: AcousticPosition, time: float) -> tuple[Reading, ...]:
         kind = "PSIMSSB in degrees" if told.kind == "PSIMSSB" else told.kind
         if not self._is_vehicles(told.beacon) or not self._vehicle.takes(kind, time):
             return ()

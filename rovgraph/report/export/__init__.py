@@ -13,13 +13,13 @@ from rovgraph.report.export.formats import (
     write_track,
 )
 from rovgraph.report.export.tagging import Tagged, tag
-from rovgraph.report.export.track import Acoustics, Fixes, Track, acoustics_of, fixes_of, read_track
+from rovgraph.report.export.track import Fixes, ShipAndBeacons, Track, acoustics_of, fixes_of, read_track
 
 __all__ = [
-    "Acoustics",
     "ExportFormat",
     "ExportOptions",
     "Fixes",
+    "ShipAndBeacons",
     "Tagged",
     "Track",
     "acoustics_of",

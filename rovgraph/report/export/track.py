@@ -38,7 +38,7 @@ class Fixes:
 
 
 @dataclass(frozen=True)
-class Acoustics:
+class ShipAndBeacons:
     """What carried an acoustic system.
 
     Attributes
@@ -72,7 +72,7 @@ class Track:
     origin: tuple[float, float] | None = None
     fixes: Fixes | None = None
     surface: float = 0.0
-    acoustics: Acoustics | None = None
+    acoustics: ShipAndBeacons | None = None
 
     @cached_property
     def lat_lon(self) -> tuple[Array, Array]:
@@ -260,7 +260,7 @@ def _read_fixes(folder: Path) -> Fixes | None:
     return fixes_of(pd.read_csv(path, usecols=columns))
 
 
-def _read_acoustics(folder: Path, summary: Mapping[str, object]) -> Acoustics | None:
+def _read_acoustics(folder: Path, summary: Mapping[str, object]) -> ShipAndBeacons | None:
     if not (folder / ACOUSTICS_FILE).is_file():
         return None
     table = pd.read_csv(folder / "calibration.csv")
@@ -272,7 +272,7 @@ def _read_acoustics(folder: Path, summary: Mapping[str, object]) -> Acoustics | 
 
 def acoustics_of(
     replies: pd.DataFrame, calibration: Mapping[str, tuple[float, float]], names: Sequence[str]
-) -> Acoustics | None:
+) -> ShipAndBeacons | None:
     """Ship and beacons among replies (docs/results.md), None without any.
 
     Parameters
@@ -286,7 +286,7 @@ def acoustics_of(
         north, east = (calibration.get(f"beacon_{k + 1}_{axis}") for axis in ("north", "east"))
         if north is not None and east is not None:
             beacons[name] = (float(north[0]), float(east[0]), float(north[1]), float(east[1]))
-    return Acoustics(ship, beacons) if len(ship) or beacons else None
+    return ShipAndBeacons(ship, beacons) if len(ship) or beacons else None
 
 
 def fixes_of(residuals: pd.DataFrame) -> Fixes | None:
