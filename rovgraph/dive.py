@@ -26,6 +26,7 @@ from rovgraph.inference.trajectory import Trajectory
 from rovgraph.inference.variance_sources import variance_sources
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
+from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.model.state import State
 from rovgraph.problem.calibration_roles import unknowns
@@ -153,14 +154,17 @@ class _Solver:
 
     def look_ahead(self) -> None:
         """Believe what dead reckoning shows of an acoustic system, before the dive is solved."""
-        if "usbl" in self.initial.instruments and self.initial.config.graph.find_noise:
-            for one in find_head_errors(self.log, assemble(self.log, self.initial).problem, self.initial):
-                self.initial, self.found = self.initial.believing(one.beliefs), (*self.found, one)
-        if "range" in self.initial.instruments:
-            self.beacons = find_beacons(self.log, assemble(self.log, self.initial).problem, self.initial)
-            for beacon in self.beacons:
-                self.initial = self.initial.believing(beacon.beliefs(self.initial, beacon.best))
-                self.initial.assumptions.append(beacon.text)
+        if self.initial.instruments.keys().isdisjoint(ACOUSTICS):
+            return
+        problem = assemble(self.log, self.initial).problem
+        beacons = find_beacons(self.log, problem, self.initial)
+        found = find_head_errors(self.log, problem, self.initial) if self.initial.config.graph.find_noise else []
+        for one in found:
+            self.initial, self.found = self.initial.believing(one.beliefs), (*self.found, one)
+        for beacon in beacons:
+            self.initial = self.initial.believing(beacon.beliefs(self.initial, beacon.best))
+            self.initial.assumptions.append(beacon.text)
+        self.beacons = beacons
 
     def solve(self) -> None:
         """Estimate the dive as it is believed to be, from where the last optimum stands."""

@@ -281,34 +281,33 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
     ------
     InputError : too few ranges to one of them
     """
-    out = []
+    if "range" not in initial.instruments or all(one.has_place for one in initial.config.beacons):
+        return []
+    out, every = [], problem.of_sensor("range")
+    states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
+    steps = np.linalg.norm(np.diff(states.p_n, axis=0), axis=1)
     for k, beacon in enumerate(initial.config.beacons):
-        if (beacon.north_m is not None and beacon.down_m is not None) or "range" not in initial.instruments:
+        if beacon.has_place:
             continue
-        variable = beacon_names(k)[0]
-        rows = problem.of_sensor("range")
-        rows = rows[problem.contexts(rows)[:, at.BEACON_AT] == LAYOUT[variable].start]
-        if len(rows) < FEWEST and beacon.north_m is None:
+        if beacon.north_m is not None and beacon.east_m is not None:
+            down, down_sd = _depth_of_bottom(log, None, states.p_n)
+            down += 0.5 * down_sd  # from its own depth none tells a side
+            place = np.array([beacon.north_m, beacon.east_m, down])
+            out.append(BeaconPlaces(str(beacon.name), k, place, None, beacon.sd_m, down_sd, True))
+            continue
+        rows = every[problem.contexts(every)[:, at.BEACON_AT] == LAYOUT[beacon_names(k)[0]].start]
+        if len(rows) < FEWEST:
             raise InputError(
                 f"{log.source}: {len(rows)} ranges to beacon {beacon.name}, whose place is unknown; {FEWEST} are "
                 f"needed: state beacons: [{{name: {beacon.name}, north_m: .., east_m: ..}}], or leave it out"
             )
-        states = dead_reckon(problem, initial, {name: b.mean for name, b in initial.beliefs.items()})
-        if beacon.north_m is not None and beacon.east_m is not None:
-            down, down_sd = _depth_of_bottom(log, None, states.p_n)
-            place = np.array(
-                [beacon.north_m, beacon.east_m, down + 0.5 * down_sd]
-            )  # from its own depth none tells a side
-            out.append(BeaconPlaces(str(beacon.name), k, place, None, beacon.sd_m, down_sd, True))
-            continue
-        there = _interpolated(states, problem.time, problem.rows[rows, at.TIME], {})
-        gone = np.linalg.norm(np.diff(states.p_n, axis=0), axis=1)
-        way = np.interp(problem.rows[rows, at.TIME], problem.time, np.append(0.0, np.cumsum(gone)))
-        sd = np.hypot(problem.sd(rows, 1)[:, 0], DRIFT * way)
+        time, length = problem.rows[rows, at.TIME], problem.z(rows, 1)[:, 0]
+        there = _interpolated(states, problem.time, time, {})
+        sd = np.hypot(problem.sd(rows, 1)[:, 0], DRIFT * np.interp(time, problem.time, np.append(0.0, steps.cumsum())))
         down, down_sd = _depth_of_bottom(log, beacon.down_m, there.p_n)
-        places = _trilaterate(there.p_n, problem.z(rows, 1)[:, 0], sd, down, down_sd or beacon.down_sd_m)
+        places = _trilaterate(there.p_n, length, sd, down, down_sd or beacon.down_sd_m)
         other = next((p for p, cost in places[1:] if cost - places[0][1] < RUNNER_UP), None)
-        around = max(LEAST_AROUND_M, AROUND * float(np.median(problem.z(rows, 1))))
+        around = max(LEAST_AROUND_M, AROUND * float(np.median(length)))
         out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, around, down_sd))
     return out
 

@@ -86,6 +86,7 @@ class Intake:
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out
         self._newest: dict[tuple[str | float, ...], float] = {}  # by sensor, and beacon or place
+        self._name_columns: dict[str, list[int]] = {}  # of each sensor
         self.news: list[tuple[str, str]] = []
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
@@ -121,7 +122,7 @@ class Intake:
         if size != self._sizes.setdefault(sensor, size):
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
-        of = sensor, *(value for value, label in zip(values.tolist(), self._labels(sensor), strict=False) if label)
+        of = sensor, *self._names(sensor, values)
         newest = self._newest.get(of, -np.inf)
         if abs(time - newest) < SPACING_S:
             self._left_out[sensor, "at the time of another"] += 1
@@ -131,7 +132,7 @@ class Intake:
 
     def _is_unplaced(self, sensor: str, values: Array) -> bool:
         """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
-        named = [v for v, label in zip(values.tolist(), self._labels(sensor), strict=False) if label]
+        named = self._names(sensor, values)
         name = next((self._unplaced[value] for value in named if value in self._unplaced), None)
         if self._only_beacon and all(math.isnan(value) for value in named):  # needs no name
             name = next(iter(self._unplaced.values()), None)
@@ -146,10 +147,12 @@ class Intake:
         self._left_out[sensor, why] += 1
         return True
 
-    @staticmethod
-    def _labels(sensor: str) -> tuple[bool, ...]:
-        """Which of a sensor's columns are names."""
-        return tuple(column.label for column in SENSORS[sensor].columns) if sensor in SENSORS else ()
+    def _names(self, sensor: str, values: Array) -> list[float]:
+        """Those of its values that stand for names."""
+        if sensor not in self._name_columns:
+            columns = SENSORS[sensor].columns if sensor in SENSORS else ()
+            self._name_columns[sensor] = [k for k, column in enumerate(columns) if column.label]
+        return [float(values[k]) for k in self._name_columns[sensor]]
 
     def _with_known_sd(self, sensor: str, values: Array) -> Array:
         """The values of a measurement; its own sd is NaN where it is a placeholder, as most of that sensor are."""

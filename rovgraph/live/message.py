@@ -61,7 +61,7 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
     cells = {name: value for name, value in cells.items() if np.isfinite(value)}
     found = []
     for sensor, known in SENSORS.items():
-        if not known.columns:
+        if not any(name in cells for name in known.column_names):
             continue
         lost = sensor == "dvl" and cells.get("dvl_valid") == 0.0  # a ping without bottom lock needs no velocities
         if lost or all(c in cells for c in known.required):

@@ -325,6 +325,11 @@ class Beacon(ConfigSection):
             raise PydanticCustomError("half", "expected both north_m and east_m, or neither")
         return self
 
+    @property
+    def has_place(self) -> bool:
+        """Whether north, east and depth are stated."""
+        return self.north_m is not None and self.down_m is not None
+
 
 class SensorSettings(ConfigSection):
     """Keys of a registered sensor; derive a class for other defaults or more keys."""

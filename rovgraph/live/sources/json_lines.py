@@ -66,6 +66,7 @@ class JsonRow:
         self._scale = scales(config.units, url)
         self._angles, self._rules = config.angles, config.times.rules
         turn_angles({}, config.angles, url)  # an unknown one is reported before the first line
+        self._labels = labels()
         self._unknown: set[str] = set()
         self._sensors = {c: sensor.name for sensor in SENSORS.values() for c in sensor.required} | _OTHERS
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
@@ -102,7 +103,7 @@ class JsonRow:
                 continue
             elif name == "time" and isinstance(value, str):
                 cells[name] = self._seconds(value)
-            elif name in labels() and (isinstance(value, str) or json_number(key, value) % 1.0):
+            elif name in self._labels and (isinstance(value, str) or json_number(key, value) % 1.0):
                 cells[name] = label_number(str(value))  # 7.5 is a name, as it is in a log
             else:
                 cells[name] = self._scale.get(name, _AS_IT_IS)(json_number(key, value))
