@@ -155,12 +155,10 @@ def among_beacons(
     return Dive(streams, config, motion, hidden)
 
 
-def ugps(seed: int, drift: float = 1.0) -> Dive:
-    """A vehicle below a boat's topside: x and y by sound, z by the locator's pressure sensor, a yaw that drifts."""
-    rng = np.random.default_rng([11, seed])
-    motion = replace(make_motion("survey of 20 minutes", rng), duration=600.0, depth=8.0)
-    middle = motion.local(np.arange(0.0, 600.0, 1.0)).mean(axis=0)
-    boat = Ship(
+def boat_beside(motion: Motion) -> Ship:
+    """A boat with a topside 15 m from the middle of a dive, that swings a little."""
+    middle = motion.local(np.arange(0.0, motion.duration, 1.0)).mean(axis=0)
+    return Ship(
         north=Profile(middle[0] + 12.0, (), ((1.0, 90.0, 0.0),)),
         east=Profile(middle[1] - 9.0, (), ((1.0, 70.0, 1.0),)),
         heading=Profile(0.7, (), ((0.1, 40.0, 0.2),)),
@@ -168,6 +166,13 @@ def ugps(seed: int, drift: float = 1.0) -> Dive:
         head=(0.0, 0.0, 1.0),
         position_sd=0.3,
     )
+
+
+def ugps(seed: int, drift: float = 1.0) -> Dive:
+    """A vehicle below a boat's topside: x and y by sound, z by the locator's pressure sensor, a yaw that drifts."""
+    rng = np.random.default_rng([11, seed])
+    motion = replace(make_motion("survey of 20 minutes", rng), duration=600.0, depth=8.0)
+    boat = boat_beside(motion)
     system = System(rate=2.4, range_sd=0.06, angle_sd=0.4, turn_around=0.0, arm=(0.0, 0.0, -0.2))
     vehicle = make_vehicle("mti", AIDS)
     one = usbl(motion, boat, system, rng)
@@ -192,15 +197,7 @@ def four_receivers(seed: int) -> Dive:
     """Four receivers about a boat, 1 m apart, one clock for all; a third of their ranges are missing."""
     rng = np.random.default_rng([13, seed])
     motion = replace(make_motion("survey of 20 minutes", rng), duration=600.0, depth=8.0)
-    middle = motion.local(np.arange(0.0, 600.0, 1.0)).mean(axis=0)
-    boat = Ship(
-        north=Profile(middle[0] + 12.0, (), ((1.0, 90.0, 0.0),)),
-        east=Profile(middle[1] - 9.0, (), ((1.0, 70.0, 1.0),)),
-        heading=Profile(0.7, (), ((0.1, 40.0, 0.2),)),
-        antenna=(0.0, 0.0, -1.0),
-        head=(0.0, 0.0, 1.0),
-        position_sd=0.3,
-    )
+    boat = boat_beside(motion)
     places = {str(k): (0.5 * (-1) ** (k // 2), 0.5 * (-1) ** ((k + 1) // 2), 1.0 + 0.2 * (k % 2)) for k in range(4)}
     system = System(rate=2.4, range_sd=0.03, arm=(0.0, 0.0, -0.2), turn_around=0.0)
     vehicle = make_vehicle("mti", AIDS)

@@ -242,6 +242,24 @@ def log_rotation(R: ArrayLike) -> Array:
     return q[..., :3] * _angle_over_sine(half)
 
 
+def slerp(time: Array, R: Array, at: Array) -> Array:
+    """Rotations between those of some times, along the shortest arc; beyond the ends the last turn goes on.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,), increasing, n of at least 2
+    R : ndarray, shape (n, 3, 3)
+    at : ndarray, shape (m,)
+
+    Returns
+    -------
+    ndarray, shape (m, 3, 3)
+    """
+    k = np.searchsorted(time, at).clip(1, len(time) - 1)
+    share = (at - time[k - 1]) / (time[k] - time[k - 1])
+    return np.asarray(R[k - 1] @ exp_rotation(share[:, None] * log_rotation(transpose(R[k - 1]) @ R[k])))
+
+
 def _angle_over_sine(half: Array) -> Array:
     """Angle over the sine of its half, of half angles [rad]; a series where the sine vanishes."""
     angle = 2.0 * half

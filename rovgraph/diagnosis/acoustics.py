@@ -13,7 +13,7 @@ import numpy as np
 
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, exp_rotation, log_rotation
+from rovgraph.geometry import Array, slerp
 from rovgraph.inference.dead_reckoning import dead_reckon
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Stream
@@ -179,10 +179,8 @@ def _interpolated(states: State, time: Array, wanted: Array, calibration: Mappin
     """States between keyframes: attitude by the turn between two, position and velocity along a line."""
     k = time.searchsorted(wanted).clip(1, len(time) - 1)
     share = ((wanted - time[k - 1]) / (time[k] - time[k - 1]))[:, None]
-    turn = log_rotation(np.swapaxes(states.R_nb[k - 1], 1, 2) @ states.R_nb[k])
-    R = states.R_nb[k - 1] @ exp_rotation(share * turn)
     p, v = ((1.0 - share) * a[k - 1] + share * a[k] for a in (states.p_n, states.v_n))
-    return State(R, p, v, states.bias[k], calibration)
+    return State(slerp(time, states.R_nb, wanted), p, v, states.bias[k], calibration)
 
 
 LEAST_AROUND_M, AROUND = 10.0, 0.1  # within which a beacon is sought from there on, part of its ranges

@@ -24,6 +24,7 @@ from rovgraph.geometry import (
     rpy_axes,
     rpy_from_matrix,
     rpy_jacobian,
+    slerp,
     transpose,
 )
 from rovgraph.log import tables
@@ -309,9 +310,7 @@ def _slerp(time: Array, R: Array, at: Array) -> Array:
     """
     known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
     if known.all() and len(time) > 1:
-        from scipy.spatial.transform import Rotation, Slerp  # loads half of scipy, which the smoother does not need
-
-        return np.asarray(Slerp(time, Rotation.from_matrix(R))(at).as_matrix())
+        return slerp(time, R, at)
     filled = _slerp(time, np.where(known[:, None, None], R, np.eye(3)), at) if len(time) > 1 else R[[0] * len(at)]
     gap = np.interp(at, time, np.where(known, 0.0, 1.0))
     filled[gap > 0.0] = np.nan

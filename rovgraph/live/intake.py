@@ -91,9 +91,7 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        self._unplaced = {
-            label_number(str(b.name)): str(b.name) for b in config.beacons if None in (b.north_m, b.down_m)
-        }
+        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if not b.has_place}
         self._only_beacon = len(config.beacons) == 1
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None

@@ -133,14 +133,7 @@ def separation_section(source: DiveSource) -> Section:
     ]
     title = "Separation of filtered and smoothed"
     if not {"filtered", "smoothed"} <= set(source.tracks):
-        missing = "it takes both estimates; run rovgraph smooth with --estimate both"
-        return Section(
-            "separation",
-            "Filter against smoother",
-            lead,
-            [Missing(title, missing)],
-            finding=f"Not compared: {missing}.",
-        )
+        return _not_compared(lead, "it takes both estimates; run rovgraph smooth with --estimate both")
     filtered, smoothed = source.tracks["filtered"], source.tracks["smoothed"]
     colours = {"north": "#0072B2", "east": "#D55E00", "down": "#009E73", "yaw": "#7B3294"}
     drawn, unknown, beyond, known = [], 0.0, 0, 0
@@ -152,14 +145,7 @@ def separation_section(source: DiveSource) -> Section:
             some = extremes(values)
             drawn.append(line("heading" if name == "yaw" else name, source.clock(time[some]), values[some], colour))
     if not drawn:
-        missing = "the standard deviations of the estimates are not known, or the same"
-        return Section(
-            "separation",
-            "Filter against smoother",
-            lead,
-            [Missing(title, missing)],
-            finding=f"Not compared: {missing}.",
-        )
+        return _not_compared(lead, "the standard deviations of the estimates are not known, or the same")
     note = (
         f"Left out, up to {100 * unknown:.0f} % of a line: where smoothing made the sd no smaller."
         if unknown > 0.01
