@@ -120,7 +120,7 @@ class Intake:
         if size != self._sizes.setdefault(sensor, size):
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
-        of = sensor, *self._names(sensor, values)
+        of: tuple[str | float, ...] = (sensor, *self._names(sensor, values))
         newest = self._newest.get(of, -np.inf)
         if abs(time - newest) < SPACING_S:
             self._left_out[sensor, "at the time of another"] += 1
