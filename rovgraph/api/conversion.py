@@ -13,7 +13,7 @@ from typing import Any
 
 from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
 from rovgraph.log import Log
-from rovgraph.log.beams import BEAMS, usable_beams
+from rovgraph.log.beams import usable_beams
 from rovgraph.log.tables import names_of, read_table, table_beside
 from rovgraph.log.units import groups, nearest, quantities
 from rovgraph.model.config import (
@@ -42,6 +42,7 @@ from rovgraph.readers.merging import ARRIVAL, EVERY, Merged, account, merge, not
 from rovgraph.readers.own_log import FORMAT as OWN_LOG
 from rovgraph.readers.own_log import NOTHING, Paths, is_plain_log, once
 from rovgraph.readers.recording import Recording, SourceMissing, earlier
+from rovgraph.sensors.dvl_beam import BEAMS
 
 REPORT = ".report.json"
 
@@ -80,7 +81,7 @@ class Conversion:
         """
         merged, source = self.merged, self.merged.source
         with collected_warnings() as texts:
-            beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
+            beams = usable_beams(merged.tables[BEAMS], self.config, f"beams of {source}") if BEAMS in merged.tables else None
         log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
         return replace(
             log,

@@ -37,9 +37,11 @@ from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belie
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
+from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
@@ -470,7 +472,8 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     assumptions: list[str] = []
     log, config = with_motion_model(log, config, assumptions)
     unusable = unusable_acoustics(config, log.sensors | set(expected))
-    if not log.sensors - unusable.keys() & {"dvl", "fix", *ACOUSTICS}:
+    beams = beam_sensors(config) if BEAMS in {*log.sensors, *expected} else []
+    if not log.sensors - unusable.keys() & {"dvl", "fix", *ACOUSTICS, *([BEAMS] if beams else [])}:
         raise InputError(
             f"{log.source}: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes, one of them is needed"
             + "".join(f"; {sensor} is left out: {why}" for sensor, why in unusable.items())
@@ -478,7 +481,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     assumptions += [f"{sensor} is left out: {why}" for sensor, why in unusable.items() if sensor in log]
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
-    sources, present = heading_sources(config, log.sensors), log.sensors | set(expected)
+    sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams}
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)

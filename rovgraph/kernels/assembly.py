@@ -263,7 +263,9 @@ def _look(streams: Streams, dive: DiveArrays, rule: KeyframeRule, until: float) 
             looked += 1
         elif streams.sensors[int(events[order[looked], SENSOR]), CLOSES] != 0 and time - start >= rule.min_gap:
             here, looked = 1, looked + 1
-            while rule.without_imu != 0.0 and looked < counts[ORDERED] and events[order[looked], PLACED] == time:
+            while looked < counts[ORDERED] and events[order[looked], PLACED] == time:
+                if rule.without_imu == 0.0 and streams.sensors[int(events[order[looked], SENSOR]), CLOSES] == 0:
+                    break  # the beams of one ping are at its keyframe
                 here, looked = here + 1, looked + 1
             _stand(dive, rule, time, looked, here)
         else:

@@ -38,4 +38,5 @@ BEACON_1, BEACON_1_DOWN, BEACON_2, BEACON_2_DOWN, BEACON_3, BEACON_3_DOWN, BEACO
 BEACON_5, BEACON_5_DOWN, BEACON_6, BEACON_6_DOWN, BEACON_7, BEACON_7_DOWN, BEACON_8, BEACON_8_DOWN = (
     92, 94, 95, 97, 98, 100, 101, 103
 )  # fmt: skip
-SIZE = 104  # components of the built-in calibration
+DVL_BEAM, DVL_BIAS, DVL_ALTITUDE_SCALE = 104, 113, 116
+SIZE = 117  # components of the built-in calibration

@@ -66,7 +66,7 @@ from rovgraph.kernels.measurement_row import (
     MeasuredRows,
     Z,
 )
-from rovgraph.kernels.measurements import ACOUSTIC, is_angular, predict, wrap
+from rovgraph.kernels.measurements import has_context, is_angular, predict, wrap
 from rovgraph.kernels.measurements import WORK as PREDICT_WORK
 from rovgraph.kernels.rotations import (
     cross,
@@ -346,7 +346,7 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
             H[a, j] = 0.0
         if sensor[OFFSET] >= 0.0:
             H[a, MOTION + int(sensor[OFFSET])] = 0.0
-    params, work = sensor[PARAMS:] if kind != ACOUSTIC else row[ROW:], scratch.predicting
+    params, work = row[ROW:] if has_context(kind) else sensor[PARAMS:], scratch.predicting
     if place(state, one, gravity, derive, scratch):
         there = Epoch(scratch.R, scratch.p, scratch.v, scratch.bias, state.c)
         predict(kind, there, scratch.rate, params, z, H, work)

@@ -9,7 +9,7 @@ measurement
 `SNAPSHOT`        16  motion from the keyframe: time, dR by rows, dv, dp
 `ASSUMED`          6  bias that the motion was integrated with
 `Z`, `SD`       3, 3  components, and their noise; more of each where there are more, which no kernel takes
-`CONTEXT`       0, *  where a sensor in use has it: what was known of the other end when it measured, `WIDTH` numbers
+`CONTEXT`       0, *  where a sensor in use has it: what was known of the other end, or of a beam, when it measured
 =============  =====  ==========================================================================================
 
 =============  =====  ==========================================================================================
@@ -28,6 +28,15 @@ context of an acoustic measurement
 `MOUNT_AT` ...    11  places in the calibration vector, or -1: the head's mounting (3), error of its arm (3), north and
                       east of a beacon (2), its depth, scale and offset of ranges, the clock's offset and drift, lasting
                       errors of direction (2) and of range, how late the stamp is
+=============  =====  ==========================================================================================
+
+=============  =====  ==========================================================================================
+context of a beam of a DVL
+=============  =====  ==========================================================================================
+`BEAM_ARM`         3  of the DVL, from the state's origin, b [m]
+`BEAM`, `BEAM_TILT`  3, 3  direction in the DVL's axes, and how it goes with its angle from z
+`ALTITUDE`         1  over what it sees [m]
+`BEAM_AT`          1  place in the calibration vector of what its angle is off, or -1
 =============  =====  ==========================================================================================
 
 =============  =====  ==========================================================================================
@@ -78,6 +87,7 @@ MOUNT_AT, ARM_AT, BEACON_AT, DOWN_AT, SCALE_AT, OFFSET_AT, CLOCK_AT, DRIFT_AT, D
     33, 44
 )
 WIDTH = 44
+BEAM_ARM, BEAM, BEAM_TILT, ALTITUDE, BEAM_AT, BEAM_WIDTH = 0, 3, 6, 9, 10, 11
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
 PRELINEARISED = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
@@ -88,7 +98,7 @@ class MeasuredRows(NamedTuple):
 
     Attributes
     ----------
-    rows, which : shapes (m, ROW), or (m, ROW + WIDTH) where a sensor has a context, (m,), the sensor that each is of
+    rows, which : shapes (m, ROW), or wider where a sensor has a context, (m,), the sensor that each is of
     scales : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
     window : shape (m,), of each whose stamp may be late, else -1
     windows : shape (w, K, KNOT), motion around such stamps

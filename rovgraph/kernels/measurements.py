@@ -9,6 +9,9 @@ kind            equation                                                   sourc
 DVL             z = (1 + k + e) R_sb (R_bn (v_n - u_n) + (w - b_g)         (3.16), (3.17)
                 x (l + dl)), u the velocity of the bottom
 DVL_WATER       the same with c for u, c the current, without e
+DVL_BEAM        z = (1 + k + e + s h) (d + a t) . u + d . f, u of DVL     Janus geometry:
+                without its scale, d the beam's direction, t how it goes   Gordon 1996 (RDI)
+                with its angle, h the altitude
 DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17); deviation
                 less the declination, e an error that lasts                curve: Bowditch
 COMPASS         the same, with an x axis that is known
@@ -36,6 +39,7 @@ at first can be used again and again:
 
     DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; dvl_error and
                      bottom_velocity, DVL_WATER: current
+    DVL_BEAM         the same as DVL, dvl_bias, dvl_altitude_scale, and its angle
     DVL_COMPASS      rotation, its offset, error and curve, dvl_roll to dvl_yaw
     COMPASS          rotation, its offset, error and curve
     MAGNETOMETER     rotation, mag_offset to field_scale
@@ -75,6 +79,8 @@ from rovgraph.kernels.compile import Index, Matrices, Matrix, kernel, view_helpe
 from rovgraph.kernels.layout import (
     BOTTOM_VELOCITY,
     CURRENT,
+    DVL_ALTITUDE_SCALE,
+    DVL_BIAS,
     DVL_ERROR,
     DVL_LEVER_ARM,
     DVL_ROLL,
@@ -91,10 +97,15 @@ from rovgraph.kernels.layout import (
     VELOCITY,
 )
 from rovgraph.kernels.measurement_row import (
+    ALTITUDE,
     ARM,
     ARM_AT,
     ASKED,
     BEACON_AT,
+    BEAM,
+    BEAM_ARM,
+    BEAM_AT,
+    BEAM_TILT,
     CLOCK_AT,
     DIRECTION_AT,
     DOWN_AT,
@@ -261,7 +272,7 @@ def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, 
 
 
 DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY, TILT = range(9)
-ACOUSTIC = 9
+ACOUSTIC, DVL_BEAM = 9, 10
 WORK = 8  # matrices (3, 3) that `predict` needs to calculate with
 
 
@@ -272,43 +283,84 @@ def is_angular(kind: int) -> bool:
 
 
 @view_helper
+def has_context(kind: int) -> bool:
+    """Whether its numbers come with each measurement, and not with the sensor."""
+    return kind in (ACOUSTIC, DVL_BEAM)
+
+
+@view_helper
 def dvl_velocity(
     state: Epoch, rate: Array, params: Array, water: bool, z_out: Array, H_out: Array, work: Array
 ) -> None:
     """Velocity of the DVL in its own axes, over ground or relative to the water."""
-    R, v, b, c = state.R, state.v, state.b, state.c
-    R_bs, axes = work[0], work[1]
-    body, w, arm, v_b, row, turn = work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1], work[3, 2]
-    dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], R_bs, axes)
-    for i in range(3):
-        w[i] = rate[i] - b[3 + i]
-        arm[i] = params[i] + c[DVL_LEVER_ARM + i]
-        row[i] = v[i]
-    below = CURRENT if water else BOTTOM_VELOCITY
-    row[0] -= c[below]
-    row[1] -= c[below + 1]
-    rotate_back(R, row, body)
-    cross(w, arm, v_b)
-    for i in range(3):
-        v_b[i] += body[i]
-    gain = 1.0 + c[DVL_SCALE]
+    c = state.c
+    R_bs, row, gain = work[0], work[3, 1], 1.0 + c[DVL_SCALE]
+    _dvl_motion(state, rate, params, CURRENT if water else BOTTOM_VELOCITY, work)
     if not water:  # the bottom's slope is the bottom's
         gain += c[DVL_ERROR]
     for i in range(3):
         for k in range(3):
-            row[k] = gain * R_bs[k, i]  # of (1 + k) R_sb; a row times S(u) is the row x u
-        z_out[i] = dot(row, v_b)
-        cross(row, body, H_out[i, 0:3])
-        rotate(R, row, H_out[i, VELOCITY : VELOCITY + 3])
-        cross(row, arm, H_out[i, GYR_BIAS : GYR_BIAS + 3])
-        cross(row, w, H_out[i, MOTION + DVL_LEVER_ARM : MOTION + DVL_LEVER_ARM + 3])
-        cross(row, v_b, turn)
-        rotate_back(axes, turn, H_out[i, MOTION + DVL_ROLL : MOTION + DVL_ROLL + 3])
-        H_out[i, MOTION + DVL_SCALE] = z_out[i] / gain
-        H_out[i, MOTION + below] = -H_out[i, VELOCITY]
-        H_out[i, MOTION + below + 1] = -H_out[i, VELOCITY + 1]
+            row[k] = gain * R_bs[k, i]  # of (1 + k) R_sb
+        z_out[i] = _along(state, gain, CURRENT if water else BOTTOM_VELOCITY, H_out[i], work)
         if not water:
             H_out[i, MOTION + DVL_ERROR] = H_out[i, MOTION + DVL_SCALE]
+
+
+@view_helper
+def _dvl_motion(state: Epoch, rate: Array, arm_b: Array, below: int, work: Array) -> None:
+    """The DVL's mounting and velocity: ``work`` has R_bs, the axes of its angles, and in row 2 velocity of the state's
+    origin, rate and lever arm, in 3, 0 the DVL's velocity over what is ``below``, all in b."""
+    c, body, w, arm, v_b, row = state.c, work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1]
+    dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], work[0], work[1])
+    for i in range(3):
+        w[i] = rate[i] - state.b[3 + i]
+        arm[i] = arm_b[i] + c[DVL_LEVER_ARM + i]
+        row[i] = state.v[i]
+    row[0] -= c[below]
+    row[1] -= c[below + 1]
+    rotate_back(state.R, row, body)
+    cross(w, arm, v_b)
+    for i in range(3):
+        v_b[i] += body[i]
+
+
+@view_helper
+def _along(state: Epoch, gain: float, below: int, H_out: Array, work: Array) -> float:
+    """The DVL's velocity along the direction in ``work[3, 1]``, ``gain`` times a unit vector in b; ``H_out`` is its
+    row. ``work`` is that of `_dvl_motion`."""
+    body, w, arm, v_b, row, turn = work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1], work[3, 2]
+    z = dot(row, v_b)
+    cross(row, body, H_out[0:3])  # a row times S(u) is the row x u
+    rotate(state.R, row, H_out[VELOCITY : VELOCITY + 3])
+    cross(row, arm, H_out[GYR_BIAS : GYR_BIAS + 3])
+    cross(row, w, H_out[MOTION + DVL_LEVER_ARM : MOTION + DVL_LEVER_ARM + 3])
+    cross(row, v_b, turn)
+    rotate_back(work[1], turn, H_out[MOTION + DVL_ROLL : MOTION + DVL_ROLL + 3])
+    H_out[MOTION + DVL_SCALE] = z / gain
+    H_out[MOTION + below] = -H_out[VELOCITY]
+    H_out[MOTION + below + 1] = -H_out[VELOCITY + 1]
+    return z  # type: ignore[no-any-return]
+
+
+@view_helper
+def dvl_beam(state: Epoch, rate: Array, x: Array, z_out: Array, H_out: Array, work: Array) -> None:
+    """Velocity of the DVL along one of its beams, whose context is ``x``, over ground."""
+    c, R_bs, d, row = state.c, work[0], work[4, 0], work[3, 1]
+    _dvl_motion(state, rate, x[BEAM_ARM : BEAM_ARM + 3], BOTTOM_VELOCITY, work)
+    gain, angle, along = 1.0 + c[DVL_SCALE] + c[DVL_ERROR] + x[ALTITUDE] * c[DVL_ALTITUDE_SCALE], 0.0, 0.0
+    if x[BEAM_AT] >= 0.0:
+        angle = c[int(x[BEAM_AT])]
+        rotate_back(R_bs, work[3, 0], d)  # the DVL's velocity in its own axes
+        H_out[0, MOTION + int(x[BEAM_AT])] = gain * dot(d, x[BEAM_TILT : BEAM_TILT + 3])
+    for i in range(3):
+        d[i] = gain * (x[BEAM + i] + angle * x[BEAM_TILT + i])
+        along += x[BEAM + i] * c[DVL_BIAS + i]
+        H_out[0, MOTION + DVL_BIAS + i] = x[BEAM + i]
+    rotate(R_bs, d, row)
+    z_out[0] = _along(state, gain, BOTTOM_VELOCITY, H_out[0], work)
+    H_out[0, MOTION + DVL_ERROR] = H_out[0, MOTION + DVL_SCALE]
+    H_out[0, MOTION + DVL_ALTITUDE_SCALE] = x[ALTITUDE] * H_out[0, MOTION + DVL_SCALE]
+    z_out[0] += along
 
 
 @view_helper
@@ -548,6 +600,8 @@ def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H
         tilt(R, z_out, H_out)
     elif kind == ACOUSTIC:
         acoustic(state, params, z_out, H_out, work)
+    elif kind == DVL_BEAM:
+        dvl_beam(state, rate, params, z_out, H_out, work)
 
 
 @kernel()

@@ -16,6 +16,7 @@ from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
 from rovgraph.model.config import Config, config_or_defaults
+from rovgraph.sensors.dvl_beam import BEAMS
 
 
 @dataclass(frozen=True, repr=False)
@@ -32,7 +33,6 @@ class Log:
     warnings : what was ignored or sorted on reading
     settings : what its files state of the vehicle, nested as in YAML; a configuration takes precedence
     notes : how it was converted from native files, a sentence each
-    beams : what each beam of the DVL measured (`rovgraph.log.beams.beams_of`), for reports; None = not known
     """
 
     source: str
@@ -42,7 +42,6 @@ class Log:
     warnings: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    beams: Stream | None = None
 
     @staticmethod
     def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
@@ -162,12 +161,11 @@ class Log:
         return max(float(stream.time[-1]) for stream in self.streams.values())
 
     def with_beams(self, beams: Stream | None) -> "Log":
-        """The log with what each beam of its DVL measured.
+        """The log with what each beam of its DVL measured, beside its other streams.
 
         Parameters
         ----------
-        beams : of `rovgraph.log.beams.beams_of`, stamped by the log's clock as recorded: the configuration's
-            ``delay_s.dvl`` is subtracted; None = not known
+        beams : of `rovgraph.log.beams`, by the log's clock; None = not known
 
         Warns
         -----
@@ -175,11 +173,9 @@ class Log:
         """
         if beams is None:
             return self
-        delay = 0.0 if self.config is None else self.config.delay_s.get("dvl", 0.0)
-        beams = replace(beams, time=beams.time - delay)
         first, last = float(beams.time[0]), float(beams.time[-1])
         if first <= self.end and last >= self.start:
-            return replace(self, beams=beams)
+            return replace(self, streams={**self.streams, BEAMS: beams})
         with collected_warnings() as texts:
             warn(
                 f"{self.source}: the DVL's beams have times from {first:.1f} to {last:.1f} s, the log from "
@@ -236,7 +232,7 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     """
     with collected_warnings() as texts:
         table = read_table(path)
-        beams = beams_beside(Path(path))
+        beams = beams_beside(Path(path), config_or_defaults(config))
     return _log([table], config, table.source, texts).with_beams(beams)
 
 

@@ -45,6 +45,7 @@ from rovgraph.log.units import (
 )
 from rovgraph.model.config import Config, TableSettings
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
+from rovgraph.sensors.dvl_beam import BEAMS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
@@ -90,9 +91,16 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
-    for sensor in config.delay_s.keys() & found.keys():
-        found[sensor] = replace(found[sensor], time=found[sensor].time - config.delay_s[sensor])
+    for sensor in found:
+        if delay := delay_of(config, sensor):
+            found[sensor] = replace(found[sensor], time=found[sensor].time - delay)
     return found, origin
+
+
+def delay_of(config: Config, sensor: str) -> float:
+    """How much older a sensor's measurements are than their stamps [s]; beams of a DVL are stamped as its pings."""
+    delays: Mapping[str, float] = config.delay_s
+    return delays.get(sensor, delays.get("dvl", 0.0) if sensor == BEAMS else 0.0)
 
 
 def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, Stream], Origin]:
@@ -321,8 +329,11 @@ def _select(
     data = np.column_stack([cells.get(c, np.full(len(line), np.nan)) for c in columns])
     filled = ~np.isnan(data[:, [columns.index(c) for c in required]])
     complete, partly = filled.all(axis=1), filled.any(axis=1)
+    for k, name in enumerate(columns):
+        if sensor in SENSORS and SENSORS[sensor].columns[k].flag:
+            _require_flags(name, data[:, k], line, source)
     if sensor == "dvl":
-        complete, partly = _pings(data, complete, partly, line, source)
+        complete, partly = _pings(data, complete, partly)
     if sensor in SENSORS and (several := SENSORS[sensor].complete) is not None:
         complete, partly = several(data), ~np.isnan(data).all(axis=1)
     for column in SENSORS[sensor].columns if sensor in SENSORS else ():
@@ -339,15 +350,19 @@ def _select(
     return data, complete
 
 
-def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str) -> tuple[Bools, Bools]:
+def _require_flags(name: str, flags: Array, line: Lines, source: str) -> None:
+    """Check that a column holds nothing but 0 and 1."""
+    odd = np.flatnonzero(~np.isnan(flags) & (flags != 0.0) & (flags != 1.0))
+    if odd.size:
+        raise InputError(f"{source}: line {line[odd[0]]}, column {name}: {flags[odd[0]]:g}, expected 0 or 1")
+
+
+def _pings(data: Array, complete: Bools, partly: Bools) -> tuple[Bools, Bools]:
     """Rows that are pings, and rows with anything of a ping; validity becomes 0 or 1.
 
     A ping without bottom lock needs no velocities.
     """
     valid = data[:, 3]
-    odd = np.flatnonzero(~np.isnan(valid) & (valid != 0.0) & (valid != 1.0))
-    if odd.size:
-        raise InputError(f"{source}: line {line[odd[0]]}, column dvl_valid: {valid[odd[0]]:g}, expected 0 or 1")
     lost = valid == 0.0
     partly = partly | (valid == 1.0)
     valid[np.isnan(valid)] = 1.0

@@ -96,7 +96,9 @@ _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
 _OF_THE_FIELD = "rolling and pitching: on a level vehicle it cannot be told from hard_iron_z"
 _SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
-_DVL = ("dvl", "dvl_water")
+BEAM_SENSORS = tuple(f"dvl_beam_{k}" for k in range(9))  # a DVL's beams by the instrument's own numbers, 0 or 1 first
+_OVER_GROUND = ("dvl", *BEAM_SENSORS)
+_DVL = (*_OVER_GROUND, "dvl_water")
 
 
 def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "") -> tuple[Variable, Variable]:
@@ -409,7 +411,7 @@ TABLE: dict[str, Variable] = {
             _ONE,
             "1",
             0.01,
-            ("dvl",),
+            _OVER_GROUND,
             "error of bottom track that lasts, as a fraction of the velocity (slope and roughness of the bottom)",
             "position fixes; starts and stops, against the accelerometer",
             time_constant=30.0,
@@ -434,7 +436,7 @@ TABLE: dict[str, Variable] = {
             ("_north", "_east"),
             "m/s",
             0.1,
-            ("dvl",),
+            _OVER_GROUND,
             "velocity of what bottom track sees (a bed that moves, a cloud, a hull, ice, water)",
             "position fixes; the IMU, where it changes",
             time_constant=60.0,
@@ -585,6 +587,42 @@ TABLE: dict[str, Variable] = {
             "range", "|", 0.3, ("range",), "the stamps of ranges are", "legs in several directions, with a DVL"
         ),
         *(variable for k in range(BEACONS) for variable in _beacon(k)),
+        *(
+            Variable(
+                f"{beam}_angle",
+                letter,
+                _ONE,
+                "rad",
+                0.1 * _DEG,  # which a pair of a REMUS's beams is off
+                (beam,),
+                f"error of the angle between beam {k} of the DVL and its z axis",
+                "the error velocity of four beams, and position fixes for their mean",
+                considered=True,
+            )
+            for k, (beam, letter) in enumerate(zip(BEAM_SENSORS, "EGHIJKLNO", strict=True))
+        ),
+        Variable(
+            "dvl_bias",
+            "P",
+            _XYZ,
+            "m/s",
+            0.001,
+            BEAM_SENSORS,
+            "velocity that a DVL at rest shows, its own axes",
+            "resting on the bottom; position fixes far apart in time",
+            considered=True,
+        ),
+        Variable(
+            "dvl_altitude_scale",
+            "Q",
+            _ONE,
+            "1/m",
+            3e-5,
+            BEAM_SENSORS,
+            "scale error of the DVL by its altitude, as wide beams have it (absorption and slant over the footprint)",
+            "position fixes at different altitudes",
+            considered=True,
+        ),
     )
 }
 

@@ -25,7 +25,7 @@ NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = (
     *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
-    *("depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
+    *("dvl_beams", "depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
 )
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
@@ -148,6 +148,34 @@ class MotionSettings(ConfigSection):
     )
 
 
+class DvlBeams(ConfigSection):
+    """Where the beams of a DVL point, in its own axes (docs/beams.md)."""
+
+    angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
+        None, description="angle between each beam and the z axis; null = not known, so that velocities are used"
+    )
+    azimuth_deg: Annotated[tuple[float, ...], Field(max_length=8)] = Field(
+        (), description="of each beam in the order of its numbers, clockwise from the x axis seen from above"
+    )
+    first_number: Annotated[int, Field(ge=0, le=1)] = Field(1, description="the instrument's number of the first beam")
+    convex: bool = Field(True, description="false = a concave head, whose beams cross below it")
+    phased: bool = Field(
+        False, description="true = a phased array, whose angle follows the sound speed; angle_deg is that at 1536 m/s"
+    )
+
+    @model_validator(mode="after")
+    def _span(self) -> Self:
+        if not self.azimuth_deg or self.angle_deg is None:
+            return self
+        around = np.deg2rad(self.azimuth_deg)
+        directions = np.column_stack([np.cos(around), np.sin(around), np.ones(len(around))])
+        if len(around) < 3 or np.linalg.svd(directions, compute_uv=False)[-1] < 0.1:
+            raise PydanticCustomError(
+                "beams_span", "azimuth_deg: the beams do not span three axes, expected three or more different azimuths"
+            )
+        return self
+
+
 class Dvl(ConfigSection):
     """Doppler velocity log: mounting and noise."""
 
@@ -159,6 +187,15 @@ class Dvl(ConfigSection):
     velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")
     water_velocity_sd_mps: PositiveTriple = Field((0.03, 0.03, 0.03), description="noise of a water-track ping")
     scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
+    beams: DvlBeams = DvlBeams()
+    beam_sd_mps: Positive | None = Field(
+        None, description="noise of the velocity along a beam; null = what velocity_sd_mps stands for"
+    )
+    use: Literal["auto", "beams", "velocity"] = Field(
+        "auto",
+        description="auto = a ping's beams where their geometry is known, but for what the instrument refused; "
+        "beams = whatever is valid; velocity = as the instrument makes it of them",
+    )
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is rejected; null = never")
     readmit_s: Readmission = 2.0

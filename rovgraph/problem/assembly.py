@@ -23,7 +23,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.measurement_row import KNOT, MOST, WIDTH, Z
+from rovgraph.kernels.measurement_row import BEAM_WIDTH, KNOT, MOST, WIDTH, Z
 from rovgraph.kernels.preintegration import HALF_WINDOW_S
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
@@ -32,11 +32,13 @@ from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.model.state import PLACE
 from rovgraph.problem.acoustics import SHIP, Acoustics
 from rovgraph.problem.admission import TimeOffsets, admitted, pack, thruster_pieces, unpack
+from rovgraph.problem.beams import BY_BEAMS, ONE_PING_S, PingsByBeams
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity, preintegration_params, ticks, wanted
 from rovgraph.problem.problem import Problem, in_body
 from rovgraph.sensors import SENSORS, ModelAiding
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import of_instrument
 
@@ -96,11 +98,14 @@ class Assembly:
         self.names = tuple(self.instruments)
         self._which = {sensor: k for k, sensor in enumerate(self.names)}
         self._no_imu = has_constant_velocity(self.config)
-        self._sensors = np.array([self._about(s) for s in self.names], np.int64).reshape(-1, at.ABOUT)
         dims = [i.model.dim for i in self.instruments.values()]
         self._most = max([MOST, *dims])
         self._acoustics = Acoustics(self.config, self.instruments)
-        self._context = WIDTH if self._acoustics.instruments else 0
+        self._beams = PingsByBeams(self.config, self.instruments)
+        # sensors whose measurements are made before they are events, with components, sds, context and name
+        self._made = {*self._acoustics.instruments, *self._beams.instruments}
+        self._sensors = np.array([self._about(s) for s in self.names], np.int64).reshape(-1, at.ABOUT)
+        self._context = WIDTH if self._acoustics.instruments else BEAM_WIDTH if self._beams.instruments else 0
         self._wide = 2 * self._most + self._context  # components, sds and context of a measurement
         self._rule = self._make_rule(believed)
         self._integration = self._make_integration()
@@ -154,9 +159,12 @@ class Assembly:
             signals = log.streams["thruster"]
             rows = zip(signals.time.tolist(), signals.data, signals.row.tolist(), strict=True)
             self._signals = [Measurement(t, "thruster", values, row) for t, values, row in rows]
-        admissible = []
+        admissible, by_beams = self._beams.of_log(log.streams)
         for sensor, stream in streams.items():
             mask = admitted(sensor, stream.data, self.config, self._left_out)
+            if sensor == "dvl" and by_beams.any():
+                self._left_out[sensor, BY_BEAMS] += int(by_beams.sum())
+                mask &= ~by_beams
             stream = stream if mask.all() else stream.take(mask)
             if sensor in self._acoustics.instruments:
                 stream = self._acoustics.exchanges(stream, self.time_offsets.of_sensor(sensor), self._left_out)
@@ -186,7 +194,29 @@ class Assembly:
             return self._insert_acoustic(m, settled)
         if m.sensor in self._acoustics.signals:
             self._acoustics.take_one(m)
+        if self._beams.instruments and m.sensor in (BEAMS, "dvl"):
+            return self._insert_ping(m)
         return self._insert(m)
+
+    def _insert_ping(self, m: Measurement) -> InsertResult:
+        """Take a ping by its beams or by its velocity, never by both."""
+        events = self._events
+        first, last = events[:, at.STAMP].searchsorted([m.time - ONE_PING_S, m.time + ONE_PING_S])
+        here = events[first:last]
+        if m.sensor == "dvl":
+            self._beams.velocities = True
+            if np.isin(here[:, at.SENSOR], [self._which[sensor] for sensor in self._beams.instruments]).any():
+                self._left_out["dvl", BY_BEAMS] += 1
+                return InsertResult.IN
+            return self._insert(m)
+        velocity = first + np.flatnonzero((here[:, at.SENSOR] == self._which.get("dvl", -1)))
+        accepted = bool(len(velocity)) and events[velocity[0], at.FATE] < at.REFUSED
+        measured = self._beams.of_one(m, accepted)
+        if measured and accepted:
+            self._undo(m.time)
+            events[velocity[0], at.FATE] = self._refusal(BY_BEAMS)
+        results = [self._insert(one) for one in measured]
+        return next((result for result in results if result != InsertResult.IN), InsertResult.IN)
 
     def _insert_acoustic(self, m: Measurement, settled: float) -> InsertResult:
         """Take what the ship or an acoustic system says, and exchanges that it completes."""
@@ -225,7 +255,9 @@ class Assembly:
     def remove(self, sensor: str, since: float, settled: float) -> None:
         """Take back a sensor's measurements from a time on, but for what is before ``settled`` [s]."""
         events = self._events
-        wrong = (events[:, at.SENSOR] == self._which.get(sensor, -1)) & (events[:, at.STAMP] >= max(since, settled))
+        of = [sensor, *self._beams.instruments] if sensor == "dvl" else [sensor]
+        wrong = np.isin(events[:, at.SENSOR], [self._which.get(name, -1) for name in of])
+        wrong &= events[:, at.STAMP] >= max(since, settled)
         if wrong.any():
             self._undo(float(events[wrong.argmax(), at.STAMP]))
             kept = events[~wrong]
@@ -464,6 +496,7 @@ class Assembly:
             "signals": pack(twin._signals),
             "ship": self._acoustics.state(),
             "waiting": pack(self._acoustics.waiting),
+            "beams": [self._beams.velocities, self._beams.three],
             "context": self._context,
             "assumed": self.time_offsets.assumed,
         }
@@ -500,6 +533,7 @@ class Assembly:
         if "ship" in state:
             self._acoustics.restore(state["ship"])
             self._acoustics.waiting = unpack(state["waiting"])
+        self._beams.velocities, self._beams.three = state.get("beams", (False, False))
         self._periods, self._steps[:] = [], math.inf
         for period in state["periods"]:
             self._take_period(period)
@@ -511,7 +545,7 @@ class Assembly:
         table, events, twin = self._table, self._events, copy(self)
         twin._imu, twin._listed, twin._order = table.copy(), events.copy(), self._order.copy()
         twin._fresh, twin._waiting, twin._signals, twin._no_pieces = [], [], self._signals[:], self._no_pieces[:]
-        twin._acoustics = self._acoustics.copy()
+        twin._acoustics, twin._beams = self._acoustics.copy(), copy(self._beams)
         twin._left_out, twin._dive = self._left_out.copy(), at.DiveArrays._make(array.copy() for array in self._dive)
         return twin
 
@@ -615,7 +649,7 @@ class Assembly:
 
     def _closes(self, sensor: str) -> bool:
         """Whether a keyframe stands where a sensor measures."""
-        return self._no_imu or sensor == "dvl"
+        return self._no_imu or sensor == "dvl" or sensor in self._beams.instruments
 
     def _about(self, sensor: str) -> list[int]:
         """Parameters of a sensor for the kernels."""
@@ -645,23 +679,28 @@ class Assembly:
         """Events of a sensor's measurements, with why they are refused, if they are."""
         values = np.array([m.values for m in some])
         out = self._rows_of(sensor, np.array([m.time for m in some]), values, np.array([m.row for m in some]))
-        acoustic = sensor in self._acoustics.instruments  # judged as they came
-        for why, bad in () if acoustic else SENSORS[sensor].refused(values, self.config):
+        for why, bad in () if sensor in self._made else SENSORS[sensor].refused(values, self.config):  # judged before
             if bad.any():
-                if why not in self._reasons:
-                    self._reasons.append(why)
-                out[bad & (out[:, at.FATE] == at.IN), at.FATE] = at.REFUSED + self._reasons.index(why)
+                out[bad & (out[:, at.FATE] == at.IN), at.FATE] = self._refusal(why)
         return out
+
+    def _refusal(self, why: str) -> int:
+        """The fate of what is refused for a reason."""
+        if why not in self._reasons:
+            self._reasons.append(why)
+        return at.REFUSED + self._reasons.index(why)
 
     def _rows_of(self, sensor: str, time: Array, values: Array, line: NDArray[np.int64]) -> Array:
         """Events of n measurements of a sensor, shape (n, VALUES + 2 D + context)."""
         instrument, registered, D = self.instruments[sensor], SENSORS[sensor], self._most
         out, dim = np.zeros((len(time), at.VALUES + self._wide)), instrument.model.dim
         out[:, at.STAMP], out[:, at.SENSOR], out[:, at.LINE] = time, self._which[sensor], line
-        if sensor in self._acoustics.instruments:
+        if sensor in self._made:
             out[:, at.VALUES : at.VALUES + dim] = values[:, :dim]
             out[:, at.VALUES + D : at.VALUES + D + dim] = values[:, dim : 2 * dim]
-            out[:, at.VALUES + 2 * D :], out[:, at.NAME] = values[:, 2 * dim : -1], values[:, -1]
+            begin = at.VALUES + 2 * D
+            out[:, begin : begin + values.shape[1] - 2 * dim - 1] = values[:, 2 * dim : -1]
+            out[:, at.NAME] = values[:, -1]
             return out
         if sensor == PLACE:
             out[:, at.NAME] = values[:, 0]
@@ -732,7 +771,7 @@ class Assembly:
         if not self._no_imu:
             known = np.minimum(np.arange(1, len(time)), at.PERIODS + 1) - 1
             ends = time[1:][np.diff(time) > self._steps[known]]
-            pings = np.isin(which, [k for k, stream in enumerate(streams) if stream.sensor == "dvl"])
+            pings = np.isin(which, [k for k, stream in enumerate(streams) if self._closes(stream.sensor)])
             self._gaps = ends.tolist()
             ends = np.sort(np.concatenate([ends, placed[pings]]))
             edges = np.concatenate([[-np.inf], ends, [np.inf]])

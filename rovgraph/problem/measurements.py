@@ -31,7 +31,7 @@ from rovgraph.model.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY, Jacobia
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.motion import COLUMNS, SCALES
 from rovgraph.problem.problem import Index, Problem
-from rovgraph.sensors import SENSORS, AcousticExchange, SensorModel, innovation
+from rovgraph.sensors import SENSORS, AcousticExchange, DvlBeam, SensorModel, innovation
 from rovgraph.sensors.instruments import Instrument
 
 Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are admitted
@@ -207,9 +207,9 @@ class Measurements:
 
     @property
     def model(self) -> SensorModel:
-        """Their model, with what was known of the other ends."""
+        """Their model, with what was known of the other ends, or of the beams."""
         model = self.instrument.model
-        return model.of(self.problem.contexts(self.index)) if isinstance(model, AcousticExchange) else model
+        return model.of(self.problem.contexts(self.index)) if isinstance(model, AcousticExchange | DvlBeam) else model
 
     # predictions
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.log.beams import BEAMS
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.ardupilot import FRESH, GRAVITY
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.nortek import (

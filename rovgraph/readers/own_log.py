@@ -12,13 +12,14 @@ import numpy as np
 
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
-from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
+from rovgraph.log.beams import beams_beside, beams_frame
 from rovgraph.log.reading import in_order, numbers, read_columns
 from rovgraph.log.stamps import UNIX_S
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_COLUMN, is_column
 from rovgraph.log.tables import names_of, read_table
 from rovgraph.log.units import name_and_bracket
-from rovgraph.model.config import Config
+from rovgraph.model.config import Config, config_or_defaults
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.formats import ReadingOptions, formats, head_of, is_text, purpose, recognise, refusal
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 
@@ -45,7 +46,7 @@ class OwnLog:
             python_warnings.simplefilter("ignore")  # the join repeats them with the name of the file
             table = read_table(path)
             cells, names = read_columns(table, options.table)
-            beams = beams_beside(path)
+            beams = beams_beside(path, config_or_defaults(None))
             if RECEIVED in table.names:
                 cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
             try:

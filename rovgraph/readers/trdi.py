@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
-from rovgraph.log.beams import BEAMS
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)

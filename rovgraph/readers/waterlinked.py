@@ -22,7 +22,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.log.beams import BEAMS, MOST_BEAMS
+from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import Refused, json_number, json_object, shown
@@ -249,8 +249,8 @@ class _Reports:
         self._rows.extend((validity, 1e-6 * log_time, 1e-3 * since, report.water, *velocity, report.sd, altitude))
         self._faults += report.fault
         beams = row.get("transducers")
-        for beam in beams[:MOST_BEAMS] if isinstance(beams, list) and not report.water else ():
-            if isinstance(beam, dict) and _number(beam.get("id")) in range(MOST_BEAMS):
+        for beam in beams[: len(NUMBERS)] if isinstance(beams, list) and not report.water else ():
+            if isinstance(beam, dict) and _number(beam.get("id")) in NUMBERS:
                 self._beams.extend((self._taken, *(_number(beam.get(name)) for name in ("id", *_BEAM))))
         self._taken += 1
 

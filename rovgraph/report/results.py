@@ -22,7 +22,7 @@ from rovgraph.geometry import Array
 from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
-from rovgraph.log.beams import BEAMS, beams_frame
+from rovgraph.log.beams import beams_frame
 from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
@@ -30,6 +30,7 @@ from rovgraph.model.config import Config
 from rovgraph.report.folder import ACOUSTICS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
+from rovgraph.sensors.dvl_beam import BEAMS
 
 LIBRARIES = ("numpy", "scipy", "pandas", "numba", "gtsam")
 NEAREST_S = 1.0  # longest time between an altitude and its ping
@@ -229,8 +230,8 @@ def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen
     pings = dvl_frame(log, frozen)
     if pings is not None:
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
-    if log.beams is not None:
-        write_csv(beams_frame(log.beams), folder / BEAMS_FILE, decimals={"time": 4})
+    if BEAMS in log:
+        write_csv(beams_frame(log[BEAMS]), folder / BEAMS_FILE, decimals={"time": 4})
     left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []), frozen)
     write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 

@@ -83,7 +83,7 @@ class DvlVelocity:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return (*_DVL, *(("current",) if self.sensor == "dvl_water" else ("dvl_error", "bottom_velocity")))
+        return (*DVL_CALIBRATION, *(("current",) if self.sensor == "dvl_water" else ("dvl_error", "bottom_velocity")))
 
     @property
     def kind(self) -> int:
@@ -98,7 +98,7 @@ class DvlVelocity:
         return evaluate(self, self.state, state, rate_b)
 
 
-_DVL = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
+DVL_CALIBRATION = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")  # that all it measures depends on
 
 
 def over_ground(config: Config, origin_b: Array) -> Instrument:
@@ -173,7 +173,7 @@ DVL = Sensor(
     "dvl",
     (
         *(Column(name, "speed") for name in VELOCITIES),
-        Column("dvl_valid", optional=True),
+        Column("dvl_valid", optional=True, flag=True),
         Column("dvl_sd", "speed", optional=True, largest=5.0),
     ),
     over_ground,

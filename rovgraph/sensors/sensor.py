@@ -58,6 +58,7 @@ class Column:
     group : the name under which a log's unit is declared; None = the sensor's
     largest : of a measurement's own sd, the limit of such instruments; None = it has no sd, or one of any size
     label : it holds names, as text or numbers
+    flag : it holds 0 and 1
     """
 
     name: str
@@ -66,6 +67,7 @@ class Column:
     group: str | None = None
     largest: float | None = None
     label: bool = False
+    flag: bool = False
 
     def __post_init__(self) -> None:
         if self.quantity is not None and self.quantity not in get_args(Quantity):

@@ -24,7 +24,6 @@ from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
-from rovgraph.log.beams import BEAMS
 from rovgraph.log.frozen import FrozenStretch, Runs, false_values, repeats, without
 from rovgraph.log.stamps import few_digits
 from rovgraph.log.streams import GAP_PERIODS
@@ -32,6 +31,7 @@ from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.instruments import heading_sources
 
@@ -181,8 +181,7 @@ def bridge_jumps(log: Log, config: Config) -> tuple[Log, Examined | None]:
             f"{since(log, jump.before)} and {since(log, jump.after)}: bridged; the later stamps of "
             f"{', '.join(shifted)} are moved back by as much"
         )
-        beams = None if log.beams is None else _put_back(log.beams, jump)
-        log = replace(log, streams=streams, beams=beams)
+        log = replace(log, streams=streams)
     return log, None
 
 

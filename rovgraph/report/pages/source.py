@@ -22,8 +22,9 @@ from rovgraph._version import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
-from rovgraph.log.beams import beams_of
+from rovgraph.log.beams import beams_of_table
 from rovgraph.log.tables import read_table
+from rovgraph.model.config import config_or_defaults
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.pages.page import Image, Item, Missing, PageTable, Section, Text, render
 from rovgraph.report.results import BEAMS_FILE, CHI2_99
@@ -278,7 +279,7 @@ class DiveSource(ResultsSource):
         InputError : a file that cannot be used
         """
         path = self.folder / BEAMS_FILE
-        return beams_of(read_table(path)) if path.is_file() else None
+        return beams_of_table(read_table(path), config_or_defaults(None)) if path.is_file() else None
 
     @cached_property
     def silences(self) -> list[tuple[float, float]]:
