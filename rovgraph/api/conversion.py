@@ -81,7 +81,11 @@ class Conversion:
         """
         merged, source = self.merged, self.merged.source
         with collected_warnings() as texts:
-            beams = usable_beams(merged.tables[BEAMS], self.config, f"beams of {source}") if BEAMS in merged.tables else None
+            beams = (
+                usable_beams(merged.tables[BEAMS], self.config, f"beams of {source}")
+                if BEAMS in merged.tables
+                else None
+            )
         log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
         return replace(
             log,

@@ -9,7 +9,6 @@ the velocity through the water, if that is measured, plus the current of the pin
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from rovgraph.kernels.measurement_row import ASSUMED, DP, DR, DT, DV, RATE, RATE
 from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.state import State
+from rovgraph.problem.beams import SolvedPings, solved_pings
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.problem import Problem
 from rovgraph.sensors import dvl_mounting
@@ -46,6 +46,7 @@ class _Epochs:
     keyframe : ndarray of int, shape (n,), epochs of the keyframes
     problem : the dive
     measured, epoch : ndarray of int, measurements in the order of time, and the epoch of each
+    by_beams : pings that were taken by their beams, each an epoch by one of these
     """
 
     time: Array
@@ -59,6 +60,7 @@ class _Epochs:
     problem: Problem
     measured: NDArray[np.int64]
     epoch: NDArray[np.intp]
+    by_beams: SolvedPings
 
     def of(self, sensor: str | None) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Epochs and measurements of a sensor."""
@@ -124,8 +126,9 @@ def _motions(problem: Problem) -> tuple[Array, Array, Array, Array]:
 
 def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
     """The epochs of all keyframes and of some sensors."""
-    n = len(problem)
+    n, by_beams = len(problem), solved_pings(problem)
     wanted = np.isin(problem.which, [k for k, sensor in enumerate(problem.sensors) if sensor in sensors])
+    wanted[by_beams.row] = True
     measured = np.flatnonzero(wanted)
     interval, rows = problem.interval[measured], problem.rows[measured]
     here = problem.keyframe[measured] == interval
@@ -155,21 +158,28 @@ def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
         problem,
         measured,
         k,
+        by_beams,
     )
 
 
 def _pings(epochs: _Epochs, sensor: str, initial: InitialConditions, calibration: Mapping[str, Array]) -> _Pings:
     k, pings = epochs.of(sensor)
+    velocity_s, var = epochs.problem.z(pings, 3), epochs.problem.sd(pings, 3) ** 2
+    if sensor == "dvl" and len(solved := epochs.by_beams.row):
+        k = np.concatenate([k, epochs.epoch[np.isin(epochs.measured, solved)]])
+        order = np.argsort(k)
+        k, pings = k[order], np.concatenate([pings, solved])[order]
+        velocity_s = np.vstack([velocity_s, epochs.by_beams.velocity])[order]
+        var = np.vstack([var, epochs.by_beams.variance])[order]
     if not len(k):
         return _Pings(k, np.zeros((0, 3)), np.zeros(0), np.zeros(3))
     still = np.zeros((1, 3))
     R_bs = dvl_mounting(State(np.eye(3)[None], still, still, np.zeros((1, 6)), calibration))[0]
-    model: Any = initial.instruments[sensor].model
-    arm = model.lever_arm_b + calibration["dvl_lever_arm"]
+    config = initial.config
+    arm = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m) + calibration["dvl_lever_arm"]
     rows = epochs.problem.rows[pings]
     rate_b, rate_sd = rows[:, RATE : RATE + 3], rows[:, RATE_SD]
-    velocity_b = epochs.problem.z(pings, 3) @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
-    var = epochs.problem.sd(pings, 3) ** 2
+    velocity_b = velocity_s @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
     horizontal_var = 0.5 * (np.sum(var, axis=1) - np.min(var, axis=1))  # the smallest is that of the vertical
     return _Pings(k, velocity_b, horizontal_var + np.dot(arm, arm) * rate_sd**2, arm)
 

@@ -66,8 +66,8 @@ from rovgraph.kernels.measurement_row import (
     MeasuredRows,
     Z,
 )
-from rovgraph.kernels.measurements import has_context, is_angular, predict, wrap
 from rovgraph.kernels.measurements import WORK as PREDICT_WORK
+from rovgraph.kernels.measurements import has_context, is_angular, predict, wrap
 from rovgraph.kernels.rotations import (
     cross,
     exp_rotation,

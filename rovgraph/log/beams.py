@@ -48,7 +48,9 @@ def beams_of_table(table: Table, config: Config) -> Stream:
         if column in table.names and (target == "time" or target.startswith(PREFIX))
     }
     if not (named or mapped.keys() - {"time"}):
-        raise InputError(f"{table.source}: no column valid_1, velocity_1, range_1 or distance_1, expected those of each beam")
+        raise InputError(
+            f"{table.source}: no column valid_1, velocity_1, range_1 or distance_1, expected those of each beam"
+        )
     kept = ["time", *named, *mapped.values()]
     frame = table.frame[[name for name in table.names if name in kept]].rename(columns=named)
     own = config.model_copy(update={"columns": mapped, "delay_s": {BEAMS: delay_of(config, BEAMS)}})

@@ -209,7 +209,7 @@ class Assembly:
                 self._left_out["dvl", BY_BEAMS] += 1
                 return InsertResult.IN
             return self._insert(m)
-        velocity = first + np.flatnonzero((here[:, at.SENSOR] == self._which.get("dvl", -1)))
+        velocity = first + np.flatnonzero(here[:, at.SENSOR] == self._which.get("dvl", -1))
         accepted = bool(len(velocity)) and events[velocity[0], at.FATE] < at.REFUSED
         measured = self._beams.of_one(m, accepted)
         if measured and accepted:

@@ -6,16 +6,18 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement, Stream
 from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT
 from rovgraph.model.config import Config
 from rovgraph.problem.admission import admitted
+from rovgraph.problem.problem import Problem
 from rovgraph.sensors import DvlBeam
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams
 from rovgraph.sensors.instruments import Instrument
@@ -26,9 +28,14 @@ BY_BEAMS = "taken by its beams"
 
 
 def beam_sensors(config: Config) -> list[str]:
-    """The beams that pings can be taken by, as sensors; none where their geometry is not known, or velocities are used."""
+    """The sensors that pings of beams can become: each beam, and the velocity that all of them show.
+
+    None where the geometry is not known, or velocities are used.
+    """
     geometry = beam_geometry(config.dvl)
-    return [] if geometry is None or config.dvl.use == "velocity" else [BEAM_SENSORS[k] for k in geometry.numbers]
+    if geometry is None or config.dvl.use == "velocity":
+        return []
+    return ["dvl", *(BEAM_SENSORS[k] for k in geometry.numbers)]
 
 
 class PingsByBeams:
@@ -104,6 +111,38 @@ class PingsByBeams:
         ping = Stream(BEAMS, (), np.array([m.time]), m.values[None], np.array([m.row]))
         made = self.of(ping, np.array([float(accepted) if self.velocities else np.nan]))
         return [Measurement(m.time, stream.sensor, stream.data[0], m.row) for stream in made if len(stream)]
+
+
+class SolvedPings(NamedTuple):
+    """Velocities of n pings that were taken by their beams, three or more of them.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (n,), a measurement of each, in the order of time
+    velocity, variance : ndarray, shape (n, 3), in the DVL's axes [m/s, (m/s)^2]
+    """
+
+    row: NDArray[np.int64]
+    velocity: Array
+    variance: Array
+
+
+def solved_pings(problem: Problem) -> SolvedPings:
+    """Velocities by least squares of the pings of a dive that are taken by their beams."""
+    of_beam = [k for k, sensor in enumerate(problem.sensors) if sensor in BEAM_SENSORS]
+    rows = np.flatnonzero(np.isin(problem.which, of_beam))
+    if not len(rows):
+        return SolvedPings(rows, np.zeros((0, 3)), np.zeros((0, 3)))
+    _, first, ping = np.unique(problem.rows[rows, at.TIME], return_index=True, return_inverse=True)
+    d = problem.contexts(rows)[:, at.BEAM : at.BEAM + 3] / problem.sd(rows, 1)
+    information, seen = np.zeros((len(first), 3, 3)), np.zeros((len(first), 3))
+    np.add.at(information, ping, d[:, :, None] * d[:, None, :])
+    np.add.at(seen, ping, d * problem.z(rows, 1) / problem.sd(rows, 1))
+    span = np.linalg.eigvalsh(information)
+    whole = span[:, 0] > 1e-3 * span[:, 2]
+    covariance = np.linalg.inv(information[whole])
+    velocity = rotate(covariance, seen[whole])
+    return SolvedPings(rows[first[whole]], velocity, np.diagonal(covariance, axis1=1, axis2=2))
 
 
 def nearest(time: Array, to: Array) -> NDArray[np.intp]:

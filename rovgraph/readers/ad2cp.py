@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.ardupilot import FRESH, GRAVITY
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.nortek import (
@@ -26,6 +25,7 @@ from rovgraph.readers.nortek import (
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import gathered, layout
 from rovgraph.readers.stamps import unix_of_calendar
+from rovgraph.sensors.dvl_beam import BEAMS
 
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.nortek import (
     FRAME,
@@ -30,6 +29,7 @@ from rovgraph.readers.nortek import (
 )
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import gathered, layout
+from rovgraph.sensors.dvl_beam import BEAMS
 
 IMU, MAGNETOMETER, BOTTOM, WATER, AHRS, INS = 0x82, 0x87, 0xB4, 0xBE, 0xD2, 0xDC
 POSIX, BOOT = "Nucleus's Unix time", "Nucleus's time since its start"

@@ -19,9 +19,9 @@ from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_C
 from rovgraph.log.tables import names_of, read_table
 from rovgraph.log.units import name_and_bracket
 from rovgraph.model.config import Config, config_or_defaults
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.formats import ReadingOptions, formats, head_of, is_text, purpose, recognise, refusal
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.sensors.dvl_beam import BEAMS
 
 Paths = Path | str | Sequence[Path | str]  # of the files of one dive
 NOTHING: Mapping[str, Any] = {}

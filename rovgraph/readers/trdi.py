@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.sensors.dvl_beam import BEAMS
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)
 SYSTEMS = "beam", "instrument", "ship", "earth"

@@ -22,10 +22,10 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import Refused, json_number, json_object, shown
+from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS
 
 VELOCITIES = ("velocity", "velocity_water")
 FORMATS = ("json_v1", "json_v2", "json_v3")  # minor versions, as json_v3.2, only add to them

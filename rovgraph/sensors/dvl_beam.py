@@ -90,7 +90,14 @@ class DvlBeam:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return (*DVL_CALIBRATION, "dvl_error", "bottom_velocity", "dvl_bias", "dvl_altitude_scale", f"{self.sensor}_angle")
+        return (
+            *DVL_CALIBRATION,
+            "dvl_error",
+            "bottom_velocity",
+            "dvl_bias",
+            "dvl_altitude_scale",
+            f"{self.sensor}_angle",
+        )
 
     @property
     def packed(self) -> Array:
@@ -237,6 +244,6 @@ DVL_BEAMS = Sensor(
     complete=_has_any,
 )
 SINGLE_BEAMS = tuple(
-    Sensor(name, (), partial(_along_beam, number), observes=Observed("velocity"), linear_in=VELOCITY)
+    Sensor(name, (), partial(_along_beam, number), observes=Observed("velocity"))
     for number, name in enumerate(BEAM_SENSORS)
 )

@@ -31,8 +31,8 @@ from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors import SENSORS
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
 
 ENOUGH_PINGS = 50

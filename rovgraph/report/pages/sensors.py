@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.geometry import Array
-from rovgraph.log import Stream
 from rovgraph.model.calibration import TABLE
 from rovgraph.report.colours import REJECTED, SERIES
 from rovgraph.report.pages.page import (
@@ -95,7 +94,9 @@ def _validity(title: str, time: Array, beams: Beams, clock: DiveTime) -> Panel:
     note = (
         f"Blue: valid, orange: not valid, white: no ping, in every {edges[1] - edges[0]:.2g} s. Valid of all: {means}."
     )
-    return Panel(title, clock.label, "beam: valid pings [%]", drawn, note=note, names=[str(number) for number in beams.numbers])
+    return Panel(
+        title, clock.label, "beam: valid pings [%]", drawn, note=note, names=[str(number) for number in beams.numbers]
+    )
 
 
 def _ranges(time: Array, beams: Beams, clock: DiveTime, spans: Sequence[tuple[float, float, str]]) -> list[Item]:
