@@ -18,7 +18,6 @@ from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT
 from rovgraph.model.config import Config
 from rovgraph.problem.admission import admitted
 from rovgraph.problem.problem import Problem
-from rovgraph.sensors import DvlBeam
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import LARGEST_SD
@@ -49,9 +48,10 @@ class PingsByBeams:
 
     def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
         self.config = config
-        self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, DvlBeam)}
-        geometry = beam_geometry(config.dvl) if self.instruments else None
+        geometry = beam_geometry(config.dvl)
         self._numbers = () if geometry is None else geometry.numbers
+        usable = {BEAM_SENSORS[k] for k in self._numbers}
+        self.instruments = {s: i for s, i in instruments.items() if s in usable}
         self._context = np.zeros((len(self._numbers), at.BEAM_WIDTH))
         if geometry is not None:
             origin_b = np.array(config.imu.lever_arm_m)
