@@ -28,6 +28,9 @@ def case():
     return simulated(falcon(dvl={"velocity_sd_mps": [1e-5] * 3}), 60.0, seed=3, dvl_rate=4.0, imu_rate=50.0)
 
 
+EXACT = {name: {"estimate": False} for name in ("dvl_bias", *(f"dvl_beam_{k}_angle" for k in range(4)))}
+
+
 def dive(case, alter: Callable[[Array, Array], None] | None = None, **dvl):
     config = changed(started(case), dvl={"velocity_sd_mps": SD})
     return by_beams(case.log, config, alter, **dvl)
