@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dives import JANUS, by_beams, changed, falcon, incremental, simulated, started
+from live import flown
 from test_assembly import assembled
 
 from rovgraph.dive import smooth
@@ -171,3 +172,33 @@ def test_filter_smoother_and_isam2_take_beams_alike(case):
     newest = incremental(log, config).solve().trajectory.p_n[-1]
     np.testing.assert_allclose(newest, estimates["smoothed"], atol=0.02)
     np.testing.assert_allclose(estimates["filtered"], estimates["smoothed"], atol=0.2)
+
+
+def test_live_takes_pings_by_beams_as_a_log_does(case):
+    log, config = dive(case, without_fore(15.0, 30.0))
+    flight = flown(replace(case, log=log, config=config))
+    filtered = next(e for e in smooth(log, config, "both").estimates if e.kind == "filtered").trajectory
+    known = flight.solutions[-1]
+    k = int(np.abs(filtered.time - known.time).argmin())
+    np.testing.assert_allclose(known.position, filtered.p_n[k], atol=0.3 * known.position_sd[0])
+    np.testing.assert_allclose(known.position_sd, np.sqrt(np.diag(filtered.cov_p[k])), rtol=0.05)
+    assert flight.events("dvl") == ["no lock", "back"]
+    assert not [e for k in range(4) for e in flight.events(f"dvl_beam_{k}")]
+    assert known.sensors["dvl_beam_0"].used == len(log[BEAMS])
+
+
+def test_beams_of_a_ping_that_hangs_are_none(case):
+    """Live and in a log; the velocity is the same again and again, and its beams are."""
+    log, config = dive(case)
+    data, beams = log["dvl"].data.copy(), log[BEAMS].data.copy()
+    stuck = (log["dvl"].time > 20.0) & (log["dvl"].time < 30.0)
+    data[stuck], beams[stuck] = data[stuck.argmax()], beams[stuck.argmax()]
+    streams = {**log.streams, "dvl": replace(log["dvl"], data=data), BEAMS: replace(log[BEAMS], data=beams)}
+    log = replace(log, streams=streams)
+    used = {
+        r for e in smooth(log, config, "both").estimates[:1] for r in e.residuals.query("sensor=='dvl_beam_1'").time
+    }
+    assert not [t for t in used if 20.5 < t < 29.5]
+    flight = flown(replace(case, log=log, config=config))
+    assert "frozen" in flight.events("dvl")
+    assert flight.solutions[-1].sensors["dvl_beam_0"].used <= len(log[BEAMS]) - stuck.sum() + 5
