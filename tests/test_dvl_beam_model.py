@@ -10,10 +10,12 @@ from dives import JANUS, by_beams, changed, falcon, incremental, simulated, star
 from live import flown
 from test_assembly import assembled
 
+from rovgraph.diagnosis.check import examine
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.model.config import Config, parse_config
+from rovgraph.problem.beams import beam_sensors
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams, velocity_by_beams
 
 # of velocity by four beams at 22.5 deg with 5.4 mm/s [m/s]
@@ -202,3 +204,52 @@ def test_beams_of_a_ping_that_hangs_are_none(case):
     flight = flown(replace(case, log=log, config=config))
     assert "frozen" in flight.events("dvl")
     assert flight.solutions[-1].sensors["dvl_beam_0"].used <= len(log[BEAMS]) - stuck.sum() + 5
+
+
+def reordered(time: Array, along: Array) -> None:
+    along[:] = along[:, [3, 2, 1, 0]]
+
+
+WRONG = {
+    "reversed": (lambda t, b: np.negative(b, out=b), "units: {dvl_beam_velocity: -m/s}"),
+    "mm/s": (lambda t, b: np.multiply(b, 1000.0, out=b), "units: {dvl_beam_velocity: mm/s}"),
+    "another order": (reordered, "azimuth_deg: [45, 315, 225, 135], which fits"),
+    "no geometry of theirs": (lambda t, b: np.copyto(b, b + 0.5), "check dvl.beams"),
+}
+
+
+@pytest.mark.parametrize(("wrong", "said"), WRONG.values(), ids=WRONG)
+def test_beams_that_are_wrong_are_named_and_their_velocities_used(case, wrong, said):
+    log, config = dive(case)
+    right, velocity = log[BEAMS], log["dvl"]
+    altered, _ = dive(case, wrong, max_speed_mps=1e4)
+    log = replace(log, streams={**log.streams, BEAMS: altered[BEAMS]})
+    found = [f for f in examine(log, config).findings if f.sensor == BEAMS]
+    assert [f.level for f in found] == ["warning"] and said in found[0].text
+    used, why = beam_sensors(config, log.streams)
+    assert not used and said in why
+    used, why = beam_sensors(config, {**log.streams, BEAMS: right, "dvl": velocity})
+    assert used and not why
+
+
+def test_beams_by_another_clock_or_of_another_head_are_named(case):
+    log, config = dive(case)
+    later = replace(log[BEAMS], time=log[BEAMS].time + 0.1)
+    assert "stamps" in beam_sensors(config, {**log.streams, BEAMS: later})[1]
+    shifted = replace(log[BEAMS], data=np.roll(log[BEAMS].data, 5, axis=1))
+    assert "of beams 4" in beam_sensors(config, {**log.streams, BEAMS: shifted})[1]
+
+
+def test_beams_whose_geometry_is_not_known_are_said_to_need_it(case):
+    log, config = dive(case)
+    used, why = beam_sensors(changed(config, dvl={"beams": {"angle_deg": None}}), log.streams)
+    assert not used and "state dvl.beams" in why
+
+
+def test_beams_alone_carry_a_dive_without_velocities(case):
+    log, config = dive(case)
+    alone = replace(log, streams={s: x for s, x in log.streams.items() if s != "dvl"})
+    p, sd = end(alone, config)
+    by_both, _ = end(log, config)
+    np.testing.assert_allclose(p, by_both, atol=0.05)
+    assert (np.abs(p - case.truth.p_n[-1])[:2] < 3.0 * sd[:2]).all()
