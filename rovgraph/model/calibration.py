@@ -155,7 +155,9 @@ def _time_offset(
 
 ACOUSTICS = "usbl", "range"  # log streams
 BEACONS = 8  # that a dive may have
-_CONTROL = "".join(map(chr, range(1, 12)))  # letters of what beams of a DVL need; printable ones are for sensors outside
+_CONTROL = "".join(
+    map(chr, range(1, 12))
+)  # letters of what beams of a DVL need; printable ones are for sensors outside
 _MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
 
 
