@@ -68,7 +68,7 @@ def beams(log: Log, config: Config) -> Iterator[Finding]:
 
 
 def ranges(log: Log, config: Config) -> Iterator[Finding]:
-    """Ranges of the DVL's beams against its altitude: their unit, and whether they are along the beam or straight down."""
+    """Ranges of beams against its altitude: unit, and whether they are along the beam or straight down."""
     geometry = beam_geometry(config.dvl)
     if geometry is None or not {BEAMS, "dvl_altitude"} <= log.sensors:
         return
