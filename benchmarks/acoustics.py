@@ -33,12 +33,12 @@ CREW = {  # what a crew that has calibrated its system states
     "usbl_yaw": {"estimate": True, "sd_deg": 0.5},
 }
 RAW = {"usbl_roll": {"sd_deg": 1.0}, "usbl_pitch": {"sd_deg": 1.0}, "usbl_yaw": {"sd_deg": 3.0}}
-PRIORS: dict[str, dict[str, float]] = {  # of what a crew knows that it does not know; each dive draws from them
-    "dvl_roll": {"sd_deg": 2.0},
-    "dvl_pitch": {"sd_deg": 2.0},
-    "dvl_scale": {"sd": 0.02},
-    "dvl_lever_arm": {"sd": 0.05},
-    "gyr_scale": {"sd": 0.005},
+PRIORS: dict[str, dict[str, float]] = {  # of a calibrated DVL, gyro and system; each dive draws from them
+    "dvl_roll": {"sd_deg": 0.3},
+    "dvl_pitch": {"sd_deg": 0.3},
+    "dvl_scale": {"sd": 0.005},
+    "dvl_lever_arm": {"sd": 0.02},
+    "gyr_scale": {"sd": 0.002},
     "depth_offset": {"sd": 0.2},
     "depth_scale": {"sd": 0.003},
     "usbl_arm": {"sd": 0.1},
