@@ -39,7 +39,7 @@ PRIORS: dict[str, dict[str, float]] = {  # of a calibrated DVL, gyro and system;
     "dvl_scale": {"sd": 0.005},
     "dvl_lever_arm": {"sd": 0.02},
     "gyr_scale": {"sd": 0.002},
-    "depth_offset": {"sd": 0.2},
+    "depth_offset": {"sd": 0.05},
     "depth_scale": {"sd": 0.003},
     "usbl_arm": {"sd": 0.1},
     "usbl_range_offset": {"sd": 0.1},

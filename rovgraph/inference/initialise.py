@@ -295,6 +295,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
+        scale = beliefs(config)["depth_scale"]
+        if (scale.considered or scale.estimate) and start.down_sd_m is None:  # deep down it is more than the start's sd
+            sd[2] = max(sd[2], scale.sd * abs(float(p_n[2])))
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
         sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
