@@ -345,12 +345,13 @@ def rms(log_config: tuple[Log, Config], dive: Dive, **keys: object) -> tuple[flo
     return float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))), found
 
 
-def test_late_stamps_that_nobody_states_are_found_and_the_track_is_right():
-    dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False), 4)
+def test_late_stamps_that_nobody_states_are_found_among_outliers_and_the_track_is_right():
+    dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False, outliers=0.1), 4)
     error, found = rms(campaign_log(dive), dive)
     late = next(e for e in found.estimates[0].calibration if e.label == "usbl_time_offset")
     assert error < 0.6 and late.estimated and abs(late.value - 1.5) < max(0.1, 3.0 * late.sd)
     assert any(re.search(r"its stamps are 1\.[45]\d s late", line) for line in found.assumptions)
+    assert found.verdict == "trusted"  # single outliers are what the gate is for
 
 
 def test_a_healthy_dive_is_trusted_and_has_no_late_stamps():
