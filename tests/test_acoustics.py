@@ -278,6 +278,23 @@ def test_a_bent_ray_is_made_straight():
     assert abs(np.arctan2(down, across) - angle) > 0.02
 
 
+def test_without_a_depth_a_profile_is_used_from_where_the_dive_begins_and_that_is_said():
+    water = ((0.0, 1520.0), (100.0, 1480.0))
+    log, config = below_a_ship()
+    log = replace(log, streams={name: stream for name, stream in log.streams.items() if name not in ("depth", "usbl")})
+    config = config.changed(sound={"profile": water}, start={"north_m": 0.0, "east_m": 0.0, "down_m": 60.0})
+    initial = initialise(log, config)
+    assert sum("sound.profile is used with the vehicle at 60 m" in line for line in initial.assumptions) == 1
+    found = Acoustics(initial.config, {"range": initial.instruments["range"]})
+    found.take_ship(log.streams)
+    stream = log["range"].take(np.arange(4))
+    made, profile = found.exchanges(stream, 0.0, Counter()), profile_of(water)
+    assert profile is not None
+    shares = made.data[:, 0] / stream.data[np.argsort(made.row), 0]
+    speeds = [profile.mean(np.array([60.0]), np.array([b.down_m]))[0] for b in config.beacons]
+    np.testing.assert_allclose(sorted(shares), sorted(np.array(speeds) / 1500.0), rtol=1e-9)
+
+
 def test_receivers_that_share_a_clock_become_one_range_and_differences():
     arms = {"0": (0.5, 0.5, 1.0), "1": (0.5, -0.5, 1.0), "2": (-0.5, -0.5, 1.0), "3": (-0.5, 0.5, 1.0)}
     ship = {"receivers": arms, "north_m": 0.0, "east_m": 0.0, "heading_deg": 0.0}

@@ -503,6 +503,10 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
         bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
     p_n, p_sd = first_position(log, config, R_nb, assumptions)
+    if config.sound.profile is not None and "range" in sensors and "depth" not in {*log.sensors, *expected}:
+        assumptions.append(
+            f"range: sound.profile is used with the vehicle at {p_n[2]:.0f} m throughout, as the log has no depth"
+        )
     rpy, start = np.rad2deg(rpy_from_matrix(R_nb)), config.start
     filled = start.model_copy(
         update={

@@ -455,7 +455,8 @@ class Acoustics:
         heard = context[:, at.HEARD + 2]
         if sensor != "usbl" or self.config.usbl.head == "vehicle":
             lower = np.array([self._depth_of(other) for other in others])
-            vehicle = np.nan_to_num(self.signals["depth"].at(time, DEPTH_GAP_S)[0][:, 0])
+            vehicle = self.signals["depth"].at(time, DEPTH_GAP_S)[0][:, 0]
+            vehicle = np.where(np.isnan(vehicle), self.config.start.down_m or 0.0, vehicle)
             z[:, 0] *= profile.mean(vehicle, np.where(np.isnan(lower), profile.depth[-1], lower)) / believed
             return
         R_nf = context[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(self.config.usbl.mount_rpy_deg)
