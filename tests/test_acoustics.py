@@ -228,6 +228,13 @@ def test_depth_that_is_given_is_not_used_again():
     assert sd[2] > 1e5 > 1.0 > sd[0]
 
 
+def test_a_start_from_a_system_that_is_given_the_depth_is_as_near_as_its_bearings_are():
+    log, config = below_a_ship()
+    measured, given = (initialise(log, config.changed(usbl={"depth": of})).prior.p_sd for of in ("measured", "given"))
+    np.testing.assert_allclose(given[:2], measured[:2])
+    assert given[:2].max() <= 5.0
+
+
 # sound
 
 

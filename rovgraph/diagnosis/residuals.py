@@ -99,7 +99,7 @@ def rejections(out: NDArray[np.bool_], window: Array, scattering: bool) -> Array
     """
     every = np.bincount(window, out)
     if not scattering:
-        return every
+        return np.asarray(every, float)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]])))
     lasting = np.zeros(len(out))
     for begin, end in ends.reshape(-1, 2):

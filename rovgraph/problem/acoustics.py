@@ -619,7 +619,9 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
     head = x[:, at.HEARD : at.HEARD + 3]
     p = head + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
-    across = z[:, 0] * np.max(sd[:, 1:], axis=1)
+    across = z[:, 0] * np.max(
+        np.where(sd[:, 1:] < LARGEST_SD, sd[:, 1:], 0.0), axis=1
+    )  # a depth that is given is known
     columns = "fix_north", "fix_east", "down", "fix_sd"
     data = np.column_stack([p, np.hypot(across, sd[:, 0])])
     positions = Stream("usbl", columns, stream.time - late, data, stream.row)
