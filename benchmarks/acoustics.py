@@ -3,8 +3,9 @@
     python benchmarks/acoustics.py                         every row, 20 seeds
     python benchmarks/acoustics.py --rows "one beacon" --seeds 3 --online
 
-prints a table in Markdown: horizontal rms error and NEES of the smoothed, filtered and online estimates, and what
-calibration was found. Dives go through the command line.
+prints a table in Markdown: horizontal rms error and stated sd, and NEES of position, depth and heading, of the
+smoothed, filtered and online estimates. Dives go through the command line. Each dive draws its constants from the
+priors that its configuration states (`PRIORS`), but for what a row's name says.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from fault_campaign.instruments import Streams, sample
 from fault_campaign.judge import Dive, Result, run_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.scenarios import make_motion
-from fault_campaign.vehicle import configuration, make_vehicle
+from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
 
 from rovgraph.lab.executors import cores, starting, workers
 
@@ -31,6 +32,39 @@ CREW = {  # what a crew that has calibrated its system states
     "usbl_pitch": {"estimate": True, "sd_deg": 0.3},
     "usbl_yaw": {"estimate": True, "sd_deg": 0.5},
 }
+RAW = {"usbl_roll": {"sd_deg": 1.0}, "usbl_pitch": {"sd_deg": 1.0}, "usbl_yaw": {"sd_deg": 3.0}}
+PRIORS: dict[str, dict[str, float]] = {  # of a calibrated DVL, gyro and system; each dive draws from them
+    "dvl_roll": {"sd_deg": 0.3},
+    "dvl_pitch": {"sd_deg": 0.3},
+    "dvl_scale": {"sd": 0.005},
+    "dvl_lever_arm": {"sd": 0.02},
+    "gyr_scale": {"sd": 0.002},
+    "depth_offset": {"sd": 0.05},
+    "depth_scale": {"sd": 0.003},
+    "usbl_arm": {"sd": 0.1},
+    "usbl_range_offset": {"sd": 0.1},
+    "range_offset": {"sd": 0.1},
+    "sound_speed_scale": {"sd": 0.01},
+}
+GYRO_DEG = 0.3  # error of a ship's gyro, that lasts
+SUMMER = ((0.0, 1521.0), (12.0, 1520.0), (35.0, 1492.0), (80.0, 1485.0), (300.0, 1488.0))  # over a shelf
+
+
+def draw(vehicle: Vehicle, system: System, rng: np.random.Generator) -> tuple[Vehicle, System]:
+    """What vehicle and system are, of those that a configuration states."""
+
+    def off(name: str, *size: int) -> Any:
+        return rng.normal(0.0, next(iter(PRIORS[name].values())), size or None)
+
+    dvl, turn = vehicle.dvl, np.array([off("dvl_roll"), off("dvl_pitch"), 0.0])
+    arm = np.array(dvl.arm) + off("dvl_lever_arm", 3)
+    dvl = replace(dvl, mount_rpy_deg=(np.array(dvl.mount_rpy_deg) + turn).tolist(), arm=arm, scale=off("dvl_scale"))
+    imu = replace(vehicle.imu, gyr_matrix=np.diag(1.0 + off("gyr_scale", 3)))
+    depth = replace(vehicle.depth, offset=off("depth_offset"), density=off("depth_scale"))
+    factor = 1.0 + off("sound_speed_scale")
+    layers = [(z, c * factor) for z, c in system.layers]
+    water = replace(system, sound_speed=system.sound_speed * factor, layers=layers, range_offset=off("range_offset"))
+    return replace(vehicle, dvl=dvl, imu=imu, depth=depth), water
 
 
 @dataclass
@@ -45,9 +79,11 @@ class Setting:
     yaw, latency : of the head [deg], of its stamps [s], that the configuration does not state
     outliers : share of replies that are off by 50 m
     crew : the configuration states what a careful crew knows
-    speed, profile : of sound, believed to be 1500 m/s; gradient with depth [1/s]
+    speed : of sound [m/s]; 0 = drawn around the 1500 m/s that are believed
+    profile, stated : depth and speed of layered water, and whether the configuration has it
     changed : on the replies
     config : beside all that
+    drawn : constants are drawn from `PRIORS`; else what the configuration states is right, but for the head's mounting
     """
 
     seconds: float = 600.0
@@ -58,9 +94,12 @@ class Setting:
     latency: float = 0.0
     outliers: float = 0.0
     crew: bool = True
-    speed: float = 1500.0
+    speed: float = 0.0
+    profile: Sequence[tuple[float, float]] = ()
+    stated: bool = False
     changed: Callable[[pd.DataFrame, np.random.Generator], pd.DataFrame] | None = None
     config: dict[str, Any] = field(default_factory=dict)
+    drawn: bool = False
 
 
 def below_ship(setting: Setting, seed: int) -> Dive:
@@ -73,32 +112,51 @@ def below_ship(setting: Setting, seed: int) -> Dive:
         motion = replace(motion, heading=heading, velocity_b=velocity)
     middle = motion.local(np.arange(0.0, setting.seconds, 1.0)).mean(axis=0)
     spin = rng.uniform(-np.pi, np.pi)
-    lever = np.concatenate([rng.normal(0.0, 0.3, 2), [setting.yaw]]) if setting.crew else np.array([0, 0, setting.yaw])
+    lever = np.append(rng.normal(0.0, 0.3, 2) if setting.crew else [0.0, 0.0], setting.yaw)
+    constants, priors = np.random.default_rng([8, seed]), CREW if setting.crew else RAW
+    if setting.drawn:  # the yaw that counts is the head's and the gyro's
+        roll, pitch, yaw = (sd["sd_deg"] * constants.normal() for sd in priors.values())
+        share = np.sqrt(1.0 - (GYRO_DEG / priors["usbl_yaw"]["sd_deg"]) ** 2)
+        lever = np.array([roll, pitch, setting.yaw or share * yaw])
     ship = Ship(
         north=Profile(middle[0], (), ((8.0, 310.0, spin),)),
         east=Profile(middle[1], (), ((6.0, 270.0, spin + 1.0),)),
         heading=Profile(spin, ((150.0, 60.0, 0.6), (350.0, 60.0, -0.9))),
         mount_rpy_deg=lever.tolist(),
-        heading_error=rng.normal(0.0, 0.3),
+        heading_error=rng.normal(0.0, GYRO_DEG),
     )
-    system = System(latency=setting.latency, sound_speed=setting.speed)
+    system = System(latency=setting.latency, layers=setting.profile)
     vehicle = make_vehicle("mti", AIDS)
     config = merge(configuration(vehicle), Acoustic(ship, system).usbl())
     config["start"] = {}
     if setting.crew:
         config = merge(config, {"calibration": CREW})
+    if setting.stated:
+        config["sound"] = {"profile": [list(row) for row in setting.profile]}
+    if setting.drawn:
+        config = merge(config, {"calibration": priors | PRIORS})
+        vehicle, system = draw(vehicle, system, constants)
+        arm = PRIORS["usbl_arm"]["sd"] * constants.normal(size=3)
+        ship = replace(ship, head=(np.array(ship.head) + arm).tolist())
+    layers = system.layers if setting.stated else setting.profile
+    system = replace(system, layers=layers, sound_speed=setting.speed or system.sound_speed)
     streams, hidden = sample(motion, vehicle, rng)
     if not setting.dvl:
         del streams["dvl"]
     replies = usbl(motion, ship, system, rng)
     if setting.outliers:
-        bad = rng.uniform(size=len(replies)) < setting.outliers
-        replies.loc[bad, "usbl_range"] += rng.choice([-50.0, 50.0], bad.sum())
-        replies.loc[bad, "usbl_bearing"] += rng.normal(0.0, 0.5, bad.sum())
+        spoil(replies, setting.outliers, rng)
     if setting.changed is not None:
         replies = setting.changed(replies, rng)
     streams |= {"usbl": replies} | ship.says(setting.seconds, rng)
     return Dive(streams, merge(config, setting.config), motion, hidden)
+
+
+def spoil(replies: pd.DataFrame, share: float, rng: np.random.Generator) -> None:
+    """Put some replies 50 m off, in place."""
+    bad = rng.uniform(size=len(replies)) < share
+    replies.loc[bad, "usbl_range"] += rng.choice([-50.0, 50.0], bad.sum())
+    replies.loc[bad, "usbl_bearing"] += rng.normal(0.0, 0.5, bad.sum())
 
 
 def cluster(replies: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
@@ -147,6 +205,8 @@ def among_beacons(
         for name, place in places.items()
     }
     config = merge(configuration(vehicle), Acoustic(Ship(), system).ranges(known, surveyed or 1.0))
+    config = merge(config, {"calibration": PRIORS})
+    vehicle, system = draw(vehicle, system, rng)
     streams, hidden = sample(motion, vehicle, rng)
     streams["range"] = ranges(motion, places, system, rng)
     if lost:
@@ -175,6 +235,14 @@ def ugps(seed: int, drift: float = 1.0) -> Dive:
     boat = boat_beside(motion)
     system = System(rate=2.4, range_sd=0.06, angle_sd=0.4, turn_around=0.0, arm=(0.0, 0.0, -0.2))
     vehicle = make_vehicle("mti", AIDS)
+    config = merge(configuration(vehicle), Acoustic(boat, system).usbl())
+    config = merge(
+        config, {"start": None, "usbl": {"frame": "ship", "depth": "given", "one_way": True, "planar": False}}
+    )
+    config = merge(config, {"calibration": PRIORS | {"usbl_yaw": {"estimate": True, "sd_deg": 1.0}}})
+    vehicle, system = draw(vehicle, system, rng)
+    arm = PRIORS["usbl_arm"]["sd"] * rng.normal(size=3)
+    boat = replace(boat, head=(np.array(boat.head) + arm).tolist(), heading_error=rng.normal())
     one = usbl(motion, boat, system, rng)
     level = one["usbl_range"] * np.cos(one["usbl_elevation"])
     z = motion.local(one["time"].to_numpy())[:, 2] - 1.0 + rng.normal(0.0, 0.02, len(one))
@@ -183,14 +251,13 @@ def ugps(seed: int, drift: float = 1.0) -> Dive:
     replies = replies[rng.uniform(size=len(replies)) > 0.3]
     says = boat.says(600.0, rng)
     says["ship_heading"]["ship_heading"] += np.deg2rad(drift) * says["ship_heading"]["time"] / 60.0
-    config = merge(configuration(vehicle), Acoustic(boat, system).usbl())
-    config = merge(
-        config, {"start": None, "usbl": {"frame": "ship", "depth": "given", "one_way": True, "planar": False}}
-    )
     streams: Streams
     streams, hidden = sample(motion, vehicle, rng)
     del says["ship_heading"]["ship_roll"], says["ship_heading"]["ship_pitch"]
     return Dive(streams | {"usbl": replies} | says, config, motion, hidden)
+
+
+CLOCK_M, CLOCK_MPS = 0.5, 0.02  # of a locator that is not synchronised any more
 
 
 def four_receivers(seed: int) -> Dive:
@@ -201,32 +268,40 @@ def four_receivers(seed: int) -> Dive:
     places = {str(k): (0.5 * (-1) ** (k // 2), 0.5 * (-1) ** ((k + 1) // 2), 1.0 + 0.2 * (k % 2)) for k in range(4)}
     system = System(rate=2.4, range_sd=0.03, arm=(0.0, 0.0, -0.2), turn_around=0.0)
     vehicle = make_vehicle("mti", AIDS)
-    heard = heard_by_receivers(motion, boat, places, system, 0.2, rng)
-    heard = heard[rng.uniform(size=len(heard)) > 0.3]
     config = merge(configuration(vehicle), Acoustic(boat, system).ranges({}, 1.0))
+    vehicle, system = draw(vehicle, system, rng)
+    heard = heard_by_receivers(motion, boat, places, system, 0.2, rng)
+    heard["range"] += rng.normal(0.0, CLOCK_M) + rng.normal(0.0, CLOCK_MPS) * heard["time"]
+    heard = heard[rng.uniform(size=len(heard)) > 0.3]
     stated = {"one_way": True, "common_sd_m": 0.2}
     ship = {
         "antenna_m": list(boat.antenna),
         "sd_m": boat.position_sd,
         "receivers": {k: list(p) for k, p in places.items()},
     }
-    clock = {"range_clock": {"estimate": True, "sd": 0.5}}
-    config = merge(config, {"start": {"position_sd_m": 5.0}, "range": stated, "ship": ship, "calibration": clock})
+    clock = {"range_clock": {"estimate": True, "sd": CLOCK_M}, "range_clock_drift": {"estimate": True, "sd": CLOCK_MPS}}
+    start = {"position_sd_m": 5.0}
+    config = merge(config, {"start": start, "range": stated, "ship": ship, "calibration": PRIORS | clock})
     streams, hidden = sample(motion, vehicle, rng)
     return Dive(streams | {"range": heard} | boat.says(600.0, rng), config, motion, hidden)
 
 
-UNSTATED = Setting(round_ship=True, yaw=3.0, latency=2.0, outliers=0.1, crew=False)
+DRAWN = Setting(drawn=True)
+ROUND = replace(DRAWN, round_ship=True, crew=False)
 ROWS: dict[str, Callable[[int], Dive]] = {
-    "USBL": lambda seed: below_ship(Setting(), seed),
-    "round the ship": lambda seed: below_ship(Setting(round_ship=True, crew=False), seed),
-    "the same, 2 s late, 3 deg off, 10 % outliers": lambda seed: below_ship(UNSTATED, seed),
-    "no DVL": lambda seed: below_ship(Setting(dvl=False), seed),
+    "USBL": lambda seed: below_ship(DRAWN, seed),
+    "round the ship": lambda seed: below_ship(ROUND, seed),
+    "the same, 2 s late, 3 deg off, 10 % outliers": lambda seed: below_ship(
+        replace(ROUND, yaw=3.0, latency=2.0, outliers=0.1), seed
+    ),
+    "no DVL": lambda seed: below_ship(replace(DRAWN, dvl=False), seed),
     "one unknown beacon": one_beacon,
     "one unknown beacon, straight leg": lambda seed: one_beacon(seed, True, 300.0),
     "four beacons, no DVL for 5 min": lambda seed: among_beacons(seed, 4, 0.5, 0.5, 300.0),
-    "cluster after silence": lambda seed: below_ship(Setting(seconds=700.0, changed=cluster), seed),
-    "sound speed 1 % off, 1000 m": lambda seed: below_ship(Setting(depth=1000.0, speed=1515.0), seed),
+    "cluster after silence": lambda seed: below_ship(replace(DRAWN, seconds=700.0, changed=cluster), seed),
+    "sound speed 1 % off, 1000 m": lambda seed: below_ship(replace(DRAWN, depth=1000.0, speed=1515.0), seed),
+    "summer shelf, profile stated": lambda seed: below_ship(replace(DRAWN, profile=SUMMER, stated=True), seed),
+    "summer shelf, not stated": lambda seed: below_ship(replace(DRAWN, profile=SUMMER), seed),
     "topside drifts 1 deg/min": ugps,
     "four receivers, one clock": four_receivers,
     "topside does not drift": lambda seed: ugps(seed, 0.0),

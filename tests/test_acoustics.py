@@ -228,6 +228,13 @@ def test_depth_that_is_given_is_not_used_again():
     assert sd[2] > 1e5 > 1.0 > sd[0]
 
 
+def test_a_start_from_a_system_that_is_given_the_depth_is_as_near_as_its_bearings_are():
+    log, config = below_a_ship()
+    measured, given = (initialise(log, config.changed(usbl={"depth": of})).prior.p_sd for of in ("measured", "given"))
+    np.testing.assert_allclose(given[:2], measured[:2])
+    assert given[:2].max() <= 5.0
+
+
 # sound
 
 
@@ -276,6 +283,23 @@ def test_a_bent_ray_is_made_straight():
     seen = one[6 + at.SEEN : 6 + at.SEEN + 3]
     np.testing.assert_allclose(one[0] * seen, [across, 0.0, down], atol=1e-6)
     assert abs(np.arctan2(down, across) - angle) > 0.02
+
+
+def test_without_a_depth_a_profile_is_used_from_where_the_dive_begins_and_that_is_said():
+    water = ((0.0, 1520.0), (100.0, 1480.0))
+    log, config = below_a_ship()
+    log = replace(log, streams={name: stream for name, stream in log.streams.items() if name not in ("depth", "usbl")})
+    config = config.changed(sound={"profile": water}, start={"north_m": 0.0, "east_m": 0.0, "down_m": 60.0})
+    initial = initialise(log, config)
+    assert sum("sound.profile is used with the vehicle at 60 m" in line for line in initial.assumptions) == 1
+    found = Acoustics(initial.config, {"range": initial.instruments["range"]})
+    found.take_ship(log.streams)
+    stream = log["range"].take(np.arange(4))
+    made, profile = found.exchanges(stream, 0.0, Counter()), profile_of(water)
+    assert profile is not None
+    shares = made.data[:, 0] / stream.data[np.argsort(made.row), 0]
+    speeds = [profile.mean(np.array([60.0]), np.array([b.down_m]))[0] for b in config.beacons]
+    np.testing.assert_allclose(sorted(shares), sorted(np.array(speeds) / 1500.0), rtol=1e-9)
 
 
 def test_receivers_that_share_a_clock_become_one_range_and_differences():
@@ -345,12 +369,13 @@ def rms(log_config: tuple[Log, Config], dive: Dive, **keys: object) -> tuple[flo
     return float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))), found
 
 
-def test_late_stamps_that_nobody_states_are_found_and_the_track_is_right():
-    dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False), 4)
+def test_late_stamps_that_nobody_states_are_found_among_outliers_and_the_track_is_right():
+    dive = below_ship(Setting(seconds=200.0, round_ship=True, latency=1.5, yaw=2.0, crew=False, outliers=0.1), 4)
     error, found = rms(campaign_log(dive), dive)
     late = next(e for e in found.estimates[0].calibration if e.label == "usbl_time_offset")
     assert error < 0.6 and late.estimated and abs(late.value - 1.5) < max(0.1, 3.0 * late.sd)
     assert any(re.search(r"its stamps are 1\.[45]\d s late", line) for line in found.assumptions)
+    assert found.verdict == "trusted"  # single outliers are what the gate is for
 
 
 def test_a_healthy_dive_is_trusted_and_has_no_late_stamps():

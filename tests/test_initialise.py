@@ -334,6 +334,21 @@ def test_depth_of_the_start_is_the_first_sample_less_the_lever_arm():
     assert b.config.start.down_m == pytest.approx(case.truth.p_n[0, 2], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("depth", "yaml", "sd"),
+    [
+        (3.0, "{}", 0.1),
+        (300.0, "{}", 4.5),  # 1.5 % by default
+        (300.0, "calibration: {depth_scale: {sd: 0.003}}", 0.9),
+        (300.0, "calibration: {depth_scale: {estimate: false}}", 0.1),
+        (300.0, "start: {down_sd_m: 0.3}", 0.3),
+    ],
+)
+def test_a_deep_start_is_as_uncertain_as_the_sensors_scale(depth, yaml, sd):
+    log = still(LEVEL, depth=(AT, np.full((20, 1), depth)))
+    assert initialise(log, parse_config(yaml)).prior.p_sd[2] == pytest.approx(sd)
+
+
 def test_earths_rotation_needs_a_latitude(every_source):
     config = changed(every_source.config, environment={"earth_rotation": True, "latitude_deg": None})
     with pytest.raises(InputError, match=r"environment\.earth_rotation needs environment\.latitude_deg"):

@@ -1,11 +1,14 @@
 """Sensors compared by motion while data come: late stamps and wrong axes are said once, with what mends them."""
 
 import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dives import Simulated, falcon, simulated
+from dives import Simulated, campaign_log, falcon, simulated
 
 from rovgraph.live.sensor_faults import Crosscheck
 from rovgraph.log import Measurement
@@ -20,7 +23,7 @@ def dive() -> Simulated:
 
 
 def said(
-    dive: Simulated,
+    dive: Simulated | SimpleNamespace,
     late: Callable[[Measurement], float] = lambda m: 0.0,
     wrong: Callable[[Measurement], Measurement] = lambda m: m,
     kind: str = "clock",
@@ -76,3 +79,26 @@ def test_a_mirrored_axis_is_said_with_the_mounting_that_mends_it(dive):
         return m._replace(values=m.values * [1.0, -1.0, -1.0, 1.0, 1.0]) if m.sensor == "dvl" else m
 
     assert "dvl.mount_rpy_deg: [" in said(dive, wrong=mirrored, kind="check")["dvl"]
+
+
+@pytest.fixture(scope="module")
+def below_ship() -> SimpleNamespace:
+    """Legs below a ship, with replies of which a tenth is 50 m off."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    from acoustics import Setting
+    from acoustics import below_ship as dive_below
+
+    log, config = campaign_log(dive_below(Setting(seconds=110.0, outliers=0.1, round_ship=True), 3))
+    return SimpleNamespace(log=log, config=config)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 2.0])
+def test_acoustic_replies_that_nobody_stated_as_late_are_said_to_be(below_ship, seconds):
+    found = said(below_ship, lambda m: seconds * (m.sensor == "usbl"))
+    if not seconds:
+        assert found == {}
+        return
+    entry = re.search(
+        r"state delay_s: {usbl: ([\d.]+)}, or calibration.usbl_time_offset: {estimate: true", found["usbl"]
+    )
+    assert entry is not None and abs(float(entry[1]) - seconds) < 0.5

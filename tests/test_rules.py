@@ -25,6 +25,7 @@ from rovgraph.inference.gauss_newton import FaultyInterval
 from rovgraph.inference.score_test import ScoreTest
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import TABLE
+from rovgraph.model.config import Config
 from rovgraph.rules import (
     BELIEVED_SDS,
     CHANCE,
@@ -91,7 +92,13 @@ def evidence(
         Estimate("smoothed", t, [], {}, nothing if smoothed is None else smoothed),
         Estimate("filtered", t, [], {}, nothing if filtered is None else filtered, {"nis": nis or {}}),
     ]
-    given: dict[str, Any] = {"initial": None, "optimum": None, "frozen": (), "log": {}, **more}
+    given: dict[str, Any] = {
+        "initial": SimpleNamespace(config=Config()),
+        "optimum": None,
+        "frozen": (),
+        "log": {},
+        **more,
+    }
     return Evidence(estimates=both, problem=(), **given)
 
 
@@ -199,6 +206,31 @@ def test_rejected_tells_from_the_first_bad_minute_to_the_last():
     weight[np.flatnonzero(in_minute(1))[:31]] = weight[np.flatnonzero(in_minute(3))[:40]] = 0.0
     (one,) = residuals.rejected(evidence(frame("dvl", TIME, np.zeros(N), weight)))
     assert (one.figure, span_of(one)) == (pytest.approx(40 / 600), (60.0, 240.0))
+
+
+SINGLY, IN_PAIRS = np.arange(0, 60, 5), np.array([4, 5, 14, 15, 24, 25, 34, 35])
+IN_A_ROW, TOO_MANY = np.arange(10, 18), np.arange(0, 60, 3)[:16]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "out", "share"),
+    [
+        ("usbl", SINGLY, 0.0),
+        ("usbl", IN_PAIRS, 0.0),
+        ("usbl", TOO_MANY[:15], 0.0),
+        ("usbl", TOO_MANY, 16 / 60),
+        ("usbl", IN_A_ROW, 8 / 60),
+        ("usbl", np.append(IN_A_ROW, 40), 8 / 60),
+        ("range", SINGLY, 12 / 60),
+        ("fix", IN_PAIRS, 8 / 60),
+    ],
+)
+def test_of_a_usbl_single_outliers_are_no_evidence_and_those_that_follow_each_other_are(sensor, out, share):
+    weight = np.ones(60)
+    weight[out] = 0.0
+    time = START + 0.5 + np.arange(60.0)
+    (one,) = residuals.rejected(evidence(frame(sensor, time, np.zeros(60), weight)))
+    assert one.figure == pytest.approx(share)
 
 
 @pytest.mark.parametrize(("out", "share"), [(7, 0.0), (8, 8 / 60)])

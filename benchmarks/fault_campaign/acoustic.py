@@ -5,11 +5,12 @@ turn-around time D, the head hears at t2, with all of them moving (Vickery 1998)
 
     t1 = t0 + |q(t1) - h(t0)| / c,    t2 = t1 + D + |h(t2) - q(t1 + D)| / c
 
-The direction is that of q(t1 + D) at t2, in the axes of the head.
+The direction is that of q(t1 + D) at t2, in the axes of the head. In layered water rays are arcs of circles between
+the depths that are given (`ray`), found by bisection of Snell's constant.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -88,6 +89,8 @@ class System:
     sound_speed, believed_speed : of the water, and the one that ranges are made with [m/s]
     turn_around : [s]
     latency : of stamps [s]
+    range_offset : of ranges, by a turn-around time that is off [m]
+    layers : depth and sound speed, shape (k, 2) [m], [m/s]; none = ``sound_speed`` everywhere
     arm : of the transponder or transducer on the vehicle [m]
     """
 
@@ -98,31 +101,72 @@ class System:
     believed_speed: float = 1500.0
     turn_around: float = 0.05
     latency: float = 0.0
+    range_offset: float = 0.0
+    layers: Sequence[tuple[float, float]] = ()
     arm: Triple = (0.1, 0.0, -0.3)
+
+    def hears(self, here: Array, there: Array) -> tuple[Array, Array]:
+        """Seconds that sound takes between two places, and the direction from which it comes, shape (n,) and (n, 3)."""
+        away = there - here
+        straight = np.linalg.norm(away, axis=1)
+        if not len(self.layers):
+            return straight / self.sound_speed, away / straight[:, None]
+        level = np.hypot(away[:, 0], away[:, 1])
+        seconds, elevation = ray(level, here[:, 2], there[:, 2], np.asarray(self.layers, float))
+        u = away / np.maximum(level, 1e-9)[:, None] * np.cos(elevation)[:, None]
+        u[:, 2] = np.sin(elevation)
+        return seconds, u
+
+
+def ray(level: Array, begin: Array, end: Array, layers: Array) -> tuple[Array, Array]:
+    """Time [s] and angle below the horizon at its begin [rad] of rays that do not turn back (Medwin 2005, 3.3).
+
+    Parameters
+    ----------
+    level, begin, end : distance across, and depths of both ends, shape (n,) [m]
+    layers : depth and speed, shape (k, 2)
+    """
+    upper, lower = np.minimum(begin, end), np.maximum(begin, end)
+    edges = np.clip(layers[:, 0], upper[:, None], lower[:, None])
+    edges = np.concatenate([upper[:, None], edges, lower[:, None]], axis=1)
+    edges.sort(axis=1)
+    c, dz = np.interp(edges, *layers.T), np.diff(edges, axis=1)
+    c1, c2 = c[:, :-1], c[:, 1:]
+    low, high = np.zeros_like(level), 1.0 / c.max(axis=1)
+    for _ in range(60):
+        p = 0.5 * (low + high)
+        s = np.sqrt(np.maximum(1.0 - (p[:, None] * c) ** 2, 1e-18))
+        across = np.sum(p[:, None] * (c1 + c2) * dz / (s[:, :-1] + s[:, 1:]), axis=1)
+        low, high = np.where(across < level, p, low), np.where(across < level, high, p)
+    g = (c2 - c1) / np.maximum(dz, 1e-12)
+    bent = np.abs(c2 - c1) > 1e-9
+    arc = np.log(c2 * (1.0 + s[:, :-1]) / (c1 * (1.0 + s[:, 1:]))) / np.where(bent, g, 1.0)
+    seconds = np.sum(np.where(bent, arc, dz / (c1 * s[:, :-1])), axis=1)
+    elevation = np.arccos(np.minimum(p * np.interp(begin, *layers.T), 1.0))
+    return seconds, elevation * np.sign(end - begin)
 
 
 @dataclass
 class Exchange:
-    """Times and ends of exchanges: asked, answered and heard [s]; ways there and back [m]."""
+    """Times of exchanges, asked, answered and heard [s]; the way back [s], and from where it is heard."""
 
     asked: Array
     answered: Array
     heard: Array
-    there: Array
     back: Array
+    u_n: Array
 
 
-def exchange(asks: Place, answers: Place, heard: Array, speed: float, wait: float) -> Exchange:
+def exchange(asks: Place, answers: Place, heard: Array, system: System) -> Exchange:
     """The exchange of which the answer is heard at some times."""
-    here, answered = asks(heard), heard.copy()
+    here, answered, wait = asks(heard), heard.copy(), system.turn_around
     for _ in range(8):
-        back = np.linalg.norm(here - answers(answered), axis=1)
-        answered = heard - back / speed
+        back, u_n = system.hears(here, answers(answered))
+        answered = heard - back
     there_at, asked = answers(answered - wait), answered - wait
     for _ in range(8):
-        there = np.linalg.norm(asks(asked) - there_at, axis=1)
-        asked = answered - wait - there / speed
-    return Exchange(asked, answered, heard, there, back)
+        asked = answered - wait - system.hears(asks(asked), there_at)[0]
+    return Exchange(asked, answered, heard, back, u_n)
 
 
 def on_vehicle(motion: Motion, arm: Triple) -> Place:
@@ -139,13 +183,11 @@ def usbl(motion: Motion, ship: Ship, system: System, rng: np.random.Generator) -
     """Range, bearing and elevation in the head's axes, stamped when the reply is heard, or later."""
     t = np.arange(1.7, motion.duration - 1.0, 1.0 / system.rate) + rng.uniform(-0.02, 0.02)
     vehicle, head = on_vehicle(motion, system.arm), ship.place(ship.head)
-    one = exchange(head, vehicle, t, system.sound_speed, system.turn_around)
-    away_n = vehicle(one.answered) - head(t)
-    u = np.einsum("nji,nj->ni", ship.C_ns(t), away_n) @ mounting(ship.mount_rpy_deg)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    one = exchange(head, vehicle, t, system)
+    u = np.einsum("nji,nj->ni", ship.C_ns(t), one.u_n) @ mounting(ship.mount_rpy_deg)
     tilted = _perturbed(u, np.deg2rad(system.angle_sd), rng)
     seconds = one.heard - one.asked - system.turn_around
-    length = 0.5 * system.believed_speed * seconds + rng.normal(0.0, system.range_sd, len(t))
+    length = 0.5 * system.believed_speed * seconds + system.range_offset + rng.normal(0.0, system.range_sd, len(t))
     return pd.DataFrame(
         {
             "time": t + system.latency,
@@ -175,8 +217,8 @@ def ranges(
     tables, vehicle = [], on_vehicle(motion, system.arm)
     for k, (name, place) in enumerate(beacons.items()):
         t = np.arange(2.3 + k * apart, motion.duration - 1.0, 1.0 / system.rate)
-        one = exchange(vehicle, fixed(place), t, system.sound_speed, system.turn_around)
-        length = 0.5 * system.believed_speed * (t - one.asked - system.turn_around)
+        one = exchange(vehicle, fixed(place), t, system)
+        length = 0.5 * system.believed_speed * (t - one.asked - system.turn_around) + system.range_offset
         noisy = length + rng.normal(0.0, system.range_sd, len(t))
         tables.append(pd.DataFrame({"time": t + system.latency, "range": noisy, "range_beacon": name}))
     return pd.concat(tables, ignore_index=True).sort_values("time", ignore_index=True)
@@ -185,12 +227,12 @@ def ranges(
 def heard_by_receivers(
     motion: Motion, ship: Ship, receivers: dict[str, Triple], system: System, common_sd: float, rng: np.random.Generator
 ) -> pd.DataFrame:
-    """Ranges one way to receivers on a ship, whose clock has one error at a time."""
+    """Ranges one way, without a turn-around, to receivers on a ship, whose clock has one error at a time."""
     t, vehicle, tables = np.arange(1.3, motion.duration - 1.0, 1.0 / system.rate), on_vehicle(motion, system.arm), []
     clock = rng.normal(0.0, common_sd, len(t))
     for name, arm in receivers.items():
-        one = exchange(ship.place(arm), vehicle, t, system.sound_speed, 0.0)
-        length = one.back + clock + rng.normal(0.0, system.range_sd, len(t))
+        back = exchange(ship.place(arm), vehicle, t, replace(system, turn_around=0.0)).back
+        length = system.believed_speed * back + clock + rng.normal(0.0, system.range_sd, len(t))
         tables.append(pd.DataFrame({"time": t + system.latency, "range": length, "range_receiver": name}))
     return pd.concat(tables, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
 

@@ -19,12 +19,14 @@ from rovgraph.distributions import binomial_tail, chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.model.calibration import BEAM_SENSORS
+from rovgraph.model.config import Config
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.rules import CHANCE, RULES, USUAL_SHARE, Severity
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
 ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
+IN_A_ROW, SCATTERED = 3, 0.25  # from which on rejections follow each other; up to which share others count for nothing
 IN_A_MINUTE = 1.5  # times as much
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
 REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are normal, or have a rule
@@ -61,8 +63,9 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
     for r in evidence.residuals.values():
         window = windows(r.time, evidence.start, MINUTE)
         out = r.weight <= 0.0
-        share = share_rejected(np.bincount(window, out), np.bincount(window))
-        if np.bincount(window).max(initial=0) < ENOUGH and _gives_up(out):
+        count, scattering = np.bincount(window), scatters(r.sensor, evidence.initial.config)
+        share = share_rejected(rejections(out, window, scattering), count)
+        if count.max(initial=0) < ENOUGH and _gives_up(out):
             share[:] = out.mean()
         worst = int(np.argmax(share))
         bad = np.flatnonzero(share > RULES["rejected"].doubtful)
@@ -88,6 +91,35 @@ def _gives_up(out: NDArray[np.bool_]) -> bool:
     """Whether a sensor of few measurements, as fixes now and then, was rejected too often in the dive, shape (n,)."""
     by_chance = binomial_tail(max(int(out.sum()) - 1, 0), len(out), USUAL_SHARE) > CHANCE
     return bool(out.mean() > GIVEN_UP) and not by_chance
+
+
+def scatters(sensor: str, config: Config) -> bool:
+    """Whether single outliers are usual: reflections and slipping phases put replies of a transponder anywhere.
+
+    Several beacons that answer in turn, of which one may be wrong, are another matter.
+    """
+    return sensor == "usbl" and config.usbl.head == "ship"
+
+
+def rejections(out: NDArray[np.bool_], window: Array, scattering: bool) -> Array:
+    """Rejections in each of m windows that are evidence of an error, shape (m,).
+
+    Of a sensor that scatters they are those that follow each other, as those of a wrong mounting or clock or of a
+    cluster do; where much is rejected all are, since then nothing says which replies are right.
+
+    Parameters
+    ----------
+    out, window : ndarray, shape (n,), in the order of time: what was rejected, and the window of each measurement
+    scattering : `scatters`
+    """
+    every = np.bincount(window, out)
+    if not scattering:
+        return np.asarray(every, float)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]])))
+    lasting = np.zeros(len(out))
+    for begin, end in ends.reshape(-1, 2):
+        lasting[begin:end] = end - begin >= IN_A_ROW
+    return np.where(every > SCATTERED * np.bincount(window), every, np.bincount(window, lasting))
 
 
 def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:

@@ -296,6 +296,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
+        scale = beliefs(config)["depth_scale"]
+        if (scale.considered or scale.estimate) and start.down_sd_m is None:  # deep down it is more than the start's sd
+            sd[2] = max(sd[2], scale.sd * abs(float(p_n[2])))
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
         sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
@@ -505,6 +508,10 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
         bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
     p_n, p_sd = first_position(log, config, R_nb, assumptions)
+    if config.sound.profile is not None and "range" in sensors and "depth" not in {*log.sensors, *expected}:
+        assumptions.append(
+            f"range: sound.profile is used with the vehicle at {p_n[2]:.0f} m throughout, as the log has no depth"
+        )
     rpy, start = np.rad2deg(rpy_from_matrix(R_nb)), config.start
     filled = start.model_copy(
         update={

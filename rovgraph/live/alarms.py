@@ -21,6 +21,8 @@ from rovgraph.diagnosis.residuals import (
     frozen_for,
     is_one_beam,
     rejected_in,
+    rejections,
+    scatters,
     share_rejected,
     too_large_in,
     too_small_in,
@@ -52,7 +54,7 @@ class _Count:
 
     share: Array  # of its first innovation's variance, what is considered at `ALLOWED_SDS`, in units of the rest
     used: int = 0
-    rejected: int = 0
+    out: list[bool] = field(default_factory=list)  # of each, whether it was rejected
     nis: float = 0.0  # sum of those that were used
     keyframe: int = -1  # newest
 
@@ -132,11 +134,10 @@ class LiveAlarms:
             if count is None:
                 share = ALLOWED_SDS**2 * engine.considered_share(snapshot.known, met.problem, met.begin + k)
                 count = counts[sensor] = _Count(share)
+            count.out.append(weight <= 0.0)
             if weight > 0.0:
                 count.used += 1
                 count.nis += nis
-            else:
-                count.rejected += 1
             if count.keyframe != index and time >= self._start + RULES["lasting"].from_s:
                 count.keyframe = index
                 self._samples.setdefault(sensor, []).append((met, k, count.share))
@@ -174,12 +175,15 @@ class LiveAlarms:
         begin = max(self._start, time - MINUTE)
         sensors = dict.fromkeys(name for counts in self._counts for name in counts)
         met = {name: [counts[name] for counts in self._counts if name in counts] for name in sensors}
-        out = {n: sum(c.rejected for c in of) / max(sum(c.used + c.rejected for c in of), 1) for n, of in met.items()}
+        outs = {name: np.concatenate([np.array(c.out, bool) for c in of]) for name, of in met.items()}
+        shares = {name: float(out.mean()) for name, out in outs.items() if len(out)}
         for sensor, of in met.items():
-            used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
-            if rejected:
-                share = share_rejected(np.array([float(rejected)]), np.array([float(used + rejected)]))[0]
-                yield rejected_in(sensor, begin, time, float(share), self._start, is_one_beam(sensor, out))
+            used, out = sum(c.used for c in of), outs[sensor]
+            if out.any():
+                scattering = scatters(sensor, engine.initial.config)
+                counted = rejections(out, np.zeros(len(out), np.int64), scattering)
+                share = float(share_rejected(counted, np.array([len(out)]))[0])
+                yield rejected_in(sensor, begin, time, share, self._start, is_one_beam(sensor, shares))
             if used >= ENOUGH:
                 dim = engine.initial.instruments[sensor].model.dim
                 square, share = sum(c.nis for c in of) / (used * dim), float(np.mean([c.share for c in of]))

@@ -7,8 +7,8 @@ never gives are held back until then. Readings that disagree with the estimate a
 
 `Crosscheck` compares the motion of the last minutes between sensors: which stamps are late, and which axes or heading
 are wrong. It repeats the comparisons of `rovgraph check`: acceleration by DVL and IMU, turning by compasses and gyro,
-the DVL's displacement and fixes, its vertical velocity and depth. A finding of some windows in a row is reported, and
-again after half an hour if it lasts, with its figures at that time.
+the DVL's displacement and fixes, its vertical velocity and depth; of acoustic positions the lag alone. A finding of
+some windows in a row is reported, and again after half an hour if it lasts, with its figures at that time.
 
 `Health` is the state of each sensor, by the filter's innovations.
 
@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.diagnosis.check.acoustics import latency
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.dvl import dvl_and_imu
 from rovgraph.diagnosis.check.findings import Finding
@@ -337,7 +338,7 @@ WINDOW_S = 300.0  # of motion that is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
 AGAIN_S = 1800.0  # after which a lasting finding is reported again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
-CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
+CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track, latency)
 
 
 @dataclass

@@ -455,7 +455,8 @@ class Acoustics:
         heard = context[:, at.HEARD + 2]
         if sensor != "usbl" or self.config.usbl.head == "vehicle":
             lower = np.array([self._depth_of(other) for other in others])
-            vehicle = np.nan_to_num(self.signals["depth"].at(time, DEPTH_GAP_S)[0][:, 0])
+            vehicle = self.signals["depth"].at(time, DEPTH_GAP_S)[0][:, 0]
+            vehicle = np.where(np.isnan(vehicle), self.config.start.down_m or 0.0, vehicle)
             z[:, 0] *= profile.mean(vehicle, np.where(np.isnan(lower), profile.depth[-1], lower)) / believed
             return
         R_nf = context[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(self.config.usbl.mount_rpy_deg)
@@ -618,7 +619,9 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
     head = x[:, at.HEARD : at.HEARD + 3]
     p = head + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
-    across = z[:, 0] * np.max(sd[:, 1:], axis=1)
+    across = z[:, 0] * np.max(
+        np.where(sd[:, 1:] < LARGEST_SD, sd[:, 1:], 0.0), axis=1
+    )  # a depth that is given is known
     columns = "fix_north", "fix_east", "down", "fix_sd"
     data = np.column_stack([p, np.hypot(across, sd[:, 0])])
     positions = Stream("usbl", columns, stream.time - late, data, stream.row)

@@ -260,10 +260,10 @@ class _Beside:
         turn = float(np.angle(np.exp(1j * axes.yaw) / n))
         return _Fit(turn, sd, _variance(np.abs(left) ** 2), left, spread)
 
-    def lag(self, axes: "_Axes") -> "_Lag | None":
+    def lag(self, axes: "_Axes", turnings: int = TURNINGS) -> "_Lag | None":
         """The lag that leaves least in some axes, turned as the fit has them; None with too few replies."""
         found = self._lag(axes)
-        for _ in range(TURNINGS):  # tilts of the ship are those of its turned axes
+        for _ in range(turnings):  # tilts of the ship are those of its turned axes
             if found is None or abs(np.angle(np.exp(1j * (found.fit.turn - axes.yaw)))) < AXIS / 3.0:
                 return found
             axes = replace(axes, yaw=found.fit.turn)
@@ -340,22 +340,41 @@ def positions(log: Log, config: Config) -> Iterator[Finding]:
     if late.spread > ENOUGH_DISTANCE and not late.explained and (other := _other_axes(beside, late)):
         yield Finding("usbl", "warning", other, "axes")
         return
-    if late.spread < max(ENOUGH_DISTANCE, SURE * math.sqrt(late.variance)):
+    if not _moves(late):
         yield Finding("usbl", "ok", "too little movement to compare acoustic positions with the DVL's track")
         return
-    believed, sd = believed_lag(config, "usbl")
-    is_late = found.evidence > ACOUSTIC_TRACK.evidence and ACOUSTIC_TRACK.is_late(found.seconds, found.sd, (0.0, sd))
+    lag = _late(beside, found)
     yaw = late.turn if abs(late.turn) > AXIS else 0.0
-    fit = late if is_late else beside.fit(believed, replace(as_named, yaw=yaw))
+    fit = late if lag else beside.fit(believed_lag(config, "usbl")[0], replace(as_named, yaw=yaw))
     if fit is not None:
         yield from _turned(config, fit)
-    if is_late:
-        total = believed + found.seconds
-        text = (
-            f"acoustic positions come {abs(total):.1f} s {'late' if total > 0.0 else 'early'} beside the DVL's track "
-        )
-        text += f"and the ship's (sd {found.sd:.2f} s): {remedy_of_lag(config, 'usbl', total, found.sd)}"
-        yield Finding("usbl", "warning", text, "lag")
+    yield from lag
+
+
+def latency(log: Log, config: Config) -> Iterator[Finding]:
+    """The clock of acoustic positions alone, in the axes that are stated, which is quick enough for a live estimate."""
+    beside = _Beside.of(log, config)
+    found = None if beside is None else beside.lag(_Axes(config.usbl.frame), turnings=0)
+    if beside is not None and found is not None and found.fit.explained and _moves(found.fit):
+        yield from _late(beside, found)
+
+
+def _moves(fit: _Fit) -> bool:
+    """Whether the vehicle moves enough to be compared."""
+    return fit.spread >= max(ENOUGH_DISTANCE, SURE * math.sqrt(fit.variance))
+
+
+def _late(beside: _Beside, found: _Lag) -> list[Finding]:
+    """That stamps are late, where they are."""
+    believed, sd = believed_lag(beside.config, "usbl")
+    if not ACOUSTIC_TRACK.is_late(found.seconds, found.sd, (0.0, sd)) or found.evidence <= ACOUSTIC_TRACK.evidence:
+        return []
+    total = believed + found.seconds
+    text = (
+        f"acoustic positions come {abs(total):.1f} s {'late' if total > 0.0 else 'early'} beside the DVL's track "
+        f"and the ship's (sd {found.sd:.2f} s): {remedy_of_lag(beside.config, 'usbl', total, found.sd)}"
+    )
+    return [Finding("usbl", "warning", text, "lag")]
 
 
 def _other_axes(beside: _Beside, as_is: _Fit) -> str:
