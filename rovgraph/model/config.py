@@ -389,8 +389,15 @@ class Config(ConfigSection):
         return self.model_copy(update={"imu": self.imu.model_copy(update={"mag": Mag()})})
 
     def as_recorded(self) -> "Config":
-        """The same for a log whose samples and stamps are taken as they are: without delays, too."""
-        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}})
+        """The same for a log whose samples and stamps are taken as they are: without delays and speed of sound, too."""
+        dvl = self.dvl.model_copy(update={"sound_speed_set_mps": None})
+        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}, "dvl": dvl})
+
+    @property
+    def knows_sound_speed(self) -> bool:
+        """Whether the DVL's velocities are made by the speed of sound in the water."""
+        true = self.dvl.sound_speed_mps, self.sound.profile, self.sound.salinity_psu
+        return self.dvl.sound_speed_set_mps is not None and any(known is not None for known in true)
 
 
 def register_settings(sensor: str, settings: type[SensorSettings], calibration: Sequence[Variable]) -> None:
@@ -453,6 +460,8 @@ def beliefs(config: Config) -> dict[str, Belief]:
             entry.estimate == CONSIDERED,
             np.inf if lasts is None else lasts,
         )
+    if config.knows_sound_speed and config.calibration.dvl_scale.sd is None:  # type: ignore[attr-defined]
+        out["dvl_scale"] = replace(out["dvl_scale"], sd=KNOWN_SOUND_SD)
     if config.usbl.frame != "transducer":  # the system has applied its alignment
         for name in USBL_MOUNT:
             if "sd_deg" not in getattr(config.calibration, name).model_fields_set:
@@ -473,6 +482,9 @@ def beliefs(config: Config) -> dict[str, Belief]:
     return out
 
 
+KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
+
+
 def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
     """The configuration with the sds of priors that it leaves to the log.
 
@@ -488,6 +500,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
         key = "sd_deg" if variable.angular else "sd"
         if getattr(entry, key) is None:
             sd = (name in unchecked and variable.unchecked_sd) or variable.sd
+            sd = KNOWN_SOUND_SD if name == "dvl_scale" and config.knows_sound_speed else sd
             sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
             entries[name] = entry.model_copy(update={key: sd})
     return config.model_copy(update={"calibration": given.model_copy(update=entries)})
