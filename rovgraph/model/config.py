@@ -449,7 +449,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
         stated, walk = getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
-        sd = variable.sd if stated is None else unit * stated
+        sd = _usual_sd(name, config) if stated is None else unit * stated
         lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
@@ -460,8 +460,6 @@ def beliefs(config: Config) -> dict[str, Belief]:
             entry.estimate == CONSIDERED,
             np.inf if lasts is None else lasts,
         )
-    if config.knows_sound_speed and config.calibration.dvl_scale.sd is None:  # type: ignore[attr-defined]
-        out["dvl_scale"] = replace(out["dvl_scale"], sd=KNOWN_SOUND_SD)
     if config.usbl.frame != "transducer":  # the system has applied its alignment
         for name in USBL_MOUNT:
             if "sd_deg" not in getattr(config.calibration, name).model_fields_set:
@@ -485,6 +483,11 @@ def beliefs(config: Config) -> dict[str, Belief]:
 KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
 
 
+def _usual_sd(name: str, config: Config) -> float:
+    """Of a prior that is not stated."""
+    return KNOWN_SOUND_SD if name == "dvl_scale" and config.knows_sound_speed else TABLE[name].sd
+
+
 def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
     """The configuration with the sds of priors that it leaves to the log.
 
@@ -499,8 +502,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
         variable, entry = TABLE[name], getattr(given, name)
         key = "sd_deg" if variable.angular else "sd"
         if getattr(entry, key) is None:
-            sd = (name in unchecked and variable.unchecked_sd) or variable.sd
-            sd = KNOWN_SOUND_SD if name == "dvl_scale" and config.knows_sound_speed else sd
+            sd = (name in unchecked and variable.unchecked_sd) or _usual_sd(name, config)
             sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
             entries[name] = entry.model_copy(update={key: sd})
     return config.model_copy(update={"calibration": given.model_copy(update=entries)})

@@ -73,7 +73,6 @@ class AD2CP:
         channels: list[Channel] = []
         tables: dict[str, dict[str, Array]] = {}
         notes: list[str] = []
-        settings: dict[str, Any] = {}
         signature, refused = decoded_signature(content, found)
         tracks = {SIGNATURE: signature} | {k: decoded_dvl(content, found, k) for k in (DVL_BOTTOM, DVL_WATER)}
         for kind, track in tracks.items():
@@ -87,12 +86,13 @@ class AD2CP:
                     tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = table
         channels += _attitude(content, found)
         channels += _depth(content, found)
-        water, settings["dvl"] = _sound(content, found)
+        water, of_dvl = _sound(content, found)
         channels += water
         if np.isfinite(signature.beams).any():
-            settings["dvl"] |= {"beams": {"angle_deg": BEAM_ANGLE_DEG, "azimuth_deg": AZIMUTHS_DEG}}
+            of_dvl["beams"] = {"angle_deg": BEAM_ANGLE_DEG, "azimuth_deg": AZIMUTHS_DEG}
         elif any("velocity_1" in table for table in tables.values()):
-            notes.append("beams of a Nortek DVL: fit their angle and azimuths with rovgraph calibrate beams")
+            notes.append("where the beams of a Nortek DVL point is not stated: rovgraph calibrate dvl-beams fits it")
+        settings = {"dvl": of_dvl} if of_dvl else {}
         if not channels:
             raise InputError(f"{path}: holds no bottom track (records 0x17, 0x1B); the instrument has to record it")
         if any(channel.sensor == "depth" for channel in channels):

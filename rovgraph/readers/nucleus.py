@@ -97,8 +97,8 @@ class Nucleus:
         if len(records[BOTTOM].time):
             values = records[BOTTOM].values
             sound, temperature = (values[name].astype(float) for name in ("sound", "temperature"))
-            water, settings["dvl"] = sound_of_dvl(records[BOTTOM].time, sound, temperature, "bottom track", clock.name)
-            channels = (*channels, *water)
+            water, of_dvl = sound_of_dvl(records[BOTTOM].time, sound, temperature, "bottom track", clock.name)
+            channels, settings = (*channels, *water), {"dvl": of_dvl} if of_dvl else {}
         declination = records[AHRS].values["declination"]
         if len(declination) and np.isfinite(declination[0]) and declination[0]:
             settings["environment"] = {"declination_deg": round(float(declination[0]), 3)}
