@@ -72,7 +72,7 @@ def test_a_preset_says_where_the_beams_of_a_dvl_point() -> None:
 def _own(fact: Fact) -> object:
     """Another value than the preset's."""
     others = {"dvl.beams.azimuth_deg": [10.0, 130.0, 250.0], "dvl.beams.first_number": 1 - int(fact.value == 1)}
-    others |= dict.fromkeys(TRIPLES, [0.5, 0.6, 0.7]) | {"dvl.beams.phased": False}
+    others |= {key: [0.5, 0.6, 0.7] for key in TRIPLES} | {"dvl.beams.phased": False}
     return others.get(fact.key, 0.5)
 
 

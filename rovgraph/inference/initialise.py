@@ -600,7 +600,7 @@ def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
 
 
 def _resolve_sound(log: Log, config: Config, assumptions: list[str]) -> Config:
-    """Say how the DVL was corrected for the speed of sound; where nothing tells that, its scale keeps its wide prior."""
+    """Say how the DVL was corrected for the speed of sound; where it was not, its scale keeps its wide prior."""
     stream = next((log[sensor] for sensor in ("dvl", BEAMS, "dvl_water") if sensor in log), None)
     if not config.knows_sound_speed or stream is None:
         return config

@@ -99,8 +99,8 @@ class Log:
         """The log as a data frame, one row per measurement in the order of time: the inverse of `from_frame`.
 
         Columns and units are rovgraph's own (docs/log-format.md), times are those of the measurements: ``columns``,
-        ``units``, ``delay_s``, ``imu.mag`` and ``dvl.sound_speed_set_mps`` of the configuration are applied already. So read it again with a
-        configuration without them. Positions are north and east of `origin`.
+        ``units``, ``delay_s``, ``imu.mag`` and ``dvl.sound_speed_set_mps`` of the configuration are applied already. So
+        read it again with a configuration without them. Positions are north and east of `origin`.
 
         Returns
         -------

@@ -449,7 +449,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
         stated, walk = getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
-        sd = _usual_sd(name, config) if stated is None else unit * stated
+        sd = unit * stated if stated is not None and not _sd_follows(name, config) else _usual_sd(name, config)
         lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
@@ -483,9 +483,14 @@ def beliefs(config: Config) -> dict[str, Belief]:
 KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
 
 
+def _sd_follows(name: str, config: Config) -> bool:
+    """Whether the sd of a prior is not stated and follows from what is known of the sound in the water."""
+    scale = config.calibration.dvl_scale  # type: ignore[attr-defined]
+    return name == "dvl_scale" and config.knows_sound_speed and "sd" not in scale.model_fields_set
+
+
 def _usual_sd(name: str, config: Config) -> float:
-    """Of a prior that is not stated."""
-    return KNOWN_SOUND_SD if name == "dvl_scale" and config.knows_sound_speed else TABLE[name].sd
+    return KNOWN_SOUND_SD if _sd_follows(name, config) else TABLE[name].sd
 
 
 def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
@@ -501,7 +506,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     for name in TABLE if names is None else names:
         variable, entry = TABLE[name], getattr(given, name)
         key = "sd_deg" if variable.angular else "sd"
-        if getattr(entry, key) is None:
+        if getattr(entry, key) is None or _sd_follows(name, config):
             sd = (name in unchecked and variable.unchecked_sd) or _usual_sd(name, config)
             sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
             entries[name] = entry.model_copy(update={key: sd})

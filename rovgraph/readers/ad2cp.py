@@ -99,7 +99,8 @@ class AD2CP:
             notes.append(f"depth is pressure in fresh water ({FRESH:g} kg/m3) above the offset that the instrument has")
         return Recording(
             str(path), self.name, tuple(channels), {CLOCK: Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")},
-            tuple(_left(found, refused)), settings, notes=tuple(notes), warnings=tuple(_warnings(found, refused, channels)),
+            tuple(_left(found, refused)), settings, tuple(notes),
+            tuple(_warnings(found, refused, channels)),
             tables=tables,
         )  # fmt: skip
 

@@ -42,7 +42,8 @@ COMMON = layout(
     ("status", "<u4", 12),
 )  # fmt: skip
 TRACK = layout(
-    ("status", "<u4", 12), ("sound", "<f4", 24), ("temperature", "<f4", 28), ("beams", "3<f4", 36), ("distance", "3<f4", 48), ("merit", "3<f4", 60),
+    ("status", "<u4", 12), ("sound", "<f4", 24), ("temperature", "<f4", 28), ("beams", "3<f4", 36),
+    ("distance", "3<f4", 48), ("merit", "3<f4", 60),
     ("velocity", "3<f4", 96), ("sd", "3<f4", 108), ("delay", "<f4", 120),
 )  # fmt: skip
 VALUES = {  # behind the offset that each record states
