@@ -1,6 +1,7 @@
 """Native files of Doppler instruments: Teledyne PD0, PD4, PD5, PD6, Nortek AD2CP, DVL and Nucleus."""
 
 import gzip
+import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,7 +37,7 @@ from scipy.spatial.transform import Rotation
 from wire import sentence
 
 from rovgraph.api.conversion import convert
-from rovgraph.errors import InputError
+from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import matrix_from_rpy
 from rovgraph.log import Log
 from rovgraph.model.config import parse_config
@@ -425,7 +426,7 @@ def test_an_ad2cp_file_agrees_with_its_makers_own_decoding():
     depth = first(recording, "depth").columns["depth"]
     np.testing.assert_allclose(depth * 9806.65, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
     assert not first(recording, "dvl").columns["dvl_valid"].any()  # on a bench: figures of merit are none
-    assert np.ptp(made["BottomTrack_VelZ1"]) == 0.0 and made["BottomTrack_VelZ1"][0] < -10.0  # stale, and refused
+    assert (made["BottomTrack_VelZ1"] < -11.0).all()  # stale, and refused
     assert "dvl_beams" not in recording.tables
     sound = first(recording, "dvl_sound").columns
     np.testing.assert_allclose(sound["dvl_sound_speed"], made["BottomTrack_Soundspeed"], atol=1e-3)
@@ -454,7 +455,9 @@ def solved(name: str) -> tuple[Log, np.ndarray]:
     """A file's log, and velocities by its beams and the geometry that it states."""
     if not (DATA / name).exists():
         pytest.skip(f"{DATA / name} is not there")
-    made = convert([DATA / name])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        made = convert([DATA / name])
     geometry = beam_geometry(made.completed.dvl)
     beams = beams_of(made.log["dvl_beams"].data, geometry.numbers)
     return made.log, velocity_by_beams(geometry.directions, beams.velocity, beams.valid)[0]
