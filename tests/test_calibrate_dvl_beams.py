@@ -61,7 +61,7 @@ def test_a_log_without_beams_is_refused():
         rg.calibrate_dvl_beams(Log.from_arrays(time=t, dvl=np.ones((50, 3))))
 
 
-def test_the_command_prints_what_the_library_finds(tmp_path, capsys):
+def test_the_command_prints_what_the_library_finds(tmp_path, capsys, monkeypatch):
     """Reports of a Water Linked DVL."""
     log, lines = dive(), []
     beams = log["dvl_beams"]
@@ -76,8 +76,9 @@ def test_the_command_prints_what_the_library_finds(tmp_path, capsys):
     path = tmp_path / "dvl.jsonl"
     path.write_bytes(b"".join(lines))
     capsys.readouterr()
+    monkeypatch.setattr("sys.argv", ["rovgraph", "calibrate", "dvl-beams", str(path)])
     try:
-        main(["calibrate", "dvl-beams", str(path)])
+        main()
     except SystemExit as stop:
         assert not stop.code
     assert capsys.readouterr().out == rg.calibrate_dvl_beams(rg.read_log([path])).to_yaml()

@@ -123,16 +123,16 @@ def _fit(source: str, numbers: tuple[int, ...], v: Array, b: Array) -> BeamFit:
         raise InputError(f"{source}: does not show where the beams point; drive forward, sideways, up and down")
     noise = float(np.sqrt(np.mean(residual**2)))
     sd = np.rad2deg(max(noise, 1e-4) * np.sqrt(np.diag(np.linalg.inv(information))))
-    if sd[0] > KNOWN_ANGLE_DEG or sd[1:].max() > KNOWN_AZIMUTH_DEG:
-        raise InputError(
-            f"{source}: shows the beams' angle to {sd[0]:.1g} and their azimuths to {sd[1:].max():.1g} deg, needed are "
-            f"{KNOWN_ANGLE_DEG:g} and {KNOWN_AZIMUTH_DEG:g}; drive forward and sideways, and for longer"
-        )
     if noise > MISFIT * float(np.median(np.abs(z))):
         turned = np.abs(rough[:, 2]).min() > 0.5 and (rough[:, 2] < 0.0).all()
         why = "their sign is reversed (units: {dvl_beam_velocity: -m/s})" if turned else "their unit, sign or clock"
         raise InputError(
             f"{source}: velocities along the beams are {noise:.2g} m/s off any beams' at {speed:.2g} m/s; correct {why}"
+        )
+    if sd[0] > KNOWN_ANGLE_DEG or sd[1:].max() > KNOWN_AZIMUTH_DEG:
+        raise InputError(
+            f"{source}: shows the beams' angle to {sd[0]:.1g} and their azimuths to {sd[1:].max():.1g} deg, needed are "
+            f"{KNOWN_ANGLE_DEG:g} and {KNOWN_AZIMUTH_DEG:g}; drive forward and sideways, and for longer"
         )
     angle = float(np.rad2deg(fit.x[0]))
     azimuth = np.rad2deg(wrap_angle(fit.x[1:])) % 360.0
