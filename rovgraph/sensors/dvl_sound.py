@@ -26,6 +26,7 @@ DVL_SOUND = Sensor(
     "dvl_sound",
     (Column("dvl_sound_speed", "speed", optional=True), Column("water_temperature", optional=True)),
     may_begin_later=True,
+    occasional=True,
     complete=lambda data: np.asarray(np.isfinite(data).any(axis=1)),
 )
 CORRECTED = tuple(sensor.name for sensor in (DVL, DVL_WATER, DVL_ALTITUDE, DVL_BEAMS))
