@@ -192,7 +192,8 @@ class Intake:
         elif sensor == "dvl_sound":
             self._water[:2] = np.where(np.isfinite(values), values, self._water[:2])
         elif sensor in CORRECTED:
-            return self._sound.applied(sensor, values[None], WaterState(*self._water[:, None]))[0]
+            water = WaterState(self._water[:1], self._water[1:2], self._water[2:])
+            return np.asarray(self._sound.applied(sensor, values[None], water)[0])
         return values
 
     def geodetic(self, p_n: Array) -> tuple[float | None, float | None]:

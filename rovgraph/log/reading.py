@@ -129,8 +129,9 @@ def water_at(time: Array, streams: Mapping[str, Stream]) -> WaterState:
         at = np.searchsorted(stream.time[known], time, side="right") - 1
         return np.asarray(stream[column][known[np.maximum(at, 0)]])
 
-    of_dvl = (newest("dvl_sound", column) for column in ("dvl_sound_speed", "water_temperature"))
-    return WaterState(*of_dvl, newest("depth", "depth"))
+    return WaterState(
+        newest("dvl_sound", "dvl_sound_speed"), newest("dvl_sound", "water_temperature"), newest("depth", "depth")
+    )
 
 
 def delay_of(config: Config, sensor: str) -> float:

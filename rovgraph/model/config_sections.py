@@ -24,7 +24,18 @@ PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = (
-    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *(
+        "imu",
+        "mag",
+        "ahrs",
+        "vehicle_heading",
+        "vehicle_tilt",
+        "dvl",
+        "dvl_heading",
+        "dvl_altitude",
+        "dvl_water",
+        "dvl_sound",
+    ),
     *("dvl_beams", "depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
 )
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]

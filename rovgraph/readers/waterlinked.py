@@ -271,8 +271,8 @@ class _Reports:
             note = f"the DVL's settings: {', '.join(said)}"
             if said and note not in self.notes:
                 self.notes.append(note)
-            if _number(speed := result.get("speed_of_sound")) > 0.0:
-                self._speeds.add(float(speed))
+            if (speed := _number(result.get("speed_of_sound"))) > 0.0:
+                self._speeds.add(speed)
 
     def recording(self, path: Path, format_: str) -> Recording:
         """All that was taken.
