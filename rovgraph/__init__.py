@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from rovgraph.api.lab import NoiseResult as NoiseResult
     from rovgraph.api.lab import ObservabilityResult as ObservabilityResult
     from rovgraph.api.lab import PlanResult as PlanResult
+    from rovgraph.api.lab import calibrate_dvl_beams as calibrate_dvl_beams
     from rovgraph.api.lab import calibrate_magnetometer as calibrate_magnetometer
     from rovgraph.api.lab import calibrate_noise as calibrate_noise
     from rovgraph.api.lab import compare as compare
@@ -109,6 +110,7 @@ _HOMES = {
     "Result": "api.smoothing",
     "SimulatedDive": "api.simulation",
     "Trajectory": "inference.trajectory",
+    "calibrate_dvl_beams": "api.lab",
     "calibrate_magnetometer": "api.lab",
     "calibrate_noise": "api.lab",
     "check": "api.logs",

@@ -142,6 +142,7 @@ TWINS = {  # command -> the test that compares it with its function, in this fil
     "simulate": "test_simulate_writes_what_the_command_writes",
     "calibrate magnetometer": "test_calibrate_magnetometer.test_the_library_writes_what_the_command_writes_"
     "and_wants_samples_as_measured",
+    "calibrate dvl-beams": "test_calibrate_dvl_beams.test_the_command_prints_what_the_library_finds",
     "calibrate noise": "test_calibrate_noise.test_the_library_writes_what_the_command_writes",
     "study misalignment": "test_study.test_the_library_writes_what_the_command_writes",
 }

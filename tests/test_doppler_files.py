@@ -1,6 +1,7 @@
 """Native files of Doppler instruments: Teledyne PD0, PD4, PD5, PD6, Nortek AD2CP, DVL and Nucleus."""
 
 import gzip
+import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,10 +36,14 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 from wire import sentence
 
-from rovgraph.errors import InputError
+from rovgraph.api.conversion import convert
+from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import matrix_from_rpy
+from rovgraph.log import Log
+from rovgraph.model.config import parse_config
 from rovgraph.readers.formats import read_recording
 from rovgraph.readers.recording import Recording
+from rovgraph.sensors.dvl_beam import beam_geometry, beams_of, velocity_by_beams
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 RNG = np.random.default_rng(5)
@@ -159,7 +164,12 @@ def test_far_ranges_use_their_high_byte(tmp_path):
 def test_a_heading_bias_becomes_the_declination_and_an_alignment_the_mounting(tmp_path):
     pings = [pd0_ensemble(UNIX + k, rpy=(0, 0, 1.0 + 0.1 * k), system=BEAM, bias=4.5, alignment=45.0) for k in range(3)]
     recording = read(b"".join(pings), tmp_path)
-    assert recording.settings == {"environment": {"declination_deg": 4.5}, "dvl": {"mount_rpy_deg": [0.0, 0.0, 45.0]}}
+    assert recording.settings["environment"] == {"declination_deg": 4.5}
+    assert recording.settings["dvl"] == {
+        "sound_speed_set_mps": 1500.0,
+        "beams": {"angle_deg": 30.0, "azimuth_deg": [270.0, 90.0, 0.0, 180.0]},
+        "mount_rpy_deg": [0.0, 0.0, 45.0],
+    }
     heading = first(recording, "dvl_heading").columns["dvl_heading"]
     np.testing.assert_allclose(heading, 1.0 + 0.1 * np.arange(3) - np.deg2rad(4.5), atol=1e-4)
 
@@ -359,8 +369,9 @@ def test_a_remus_file_agrees_with_an_independent_decoding():
     beams = recording.tables["dvl_beams"]
     for k in range(1, 5):
         ranges = of(f"bt_beam{k}_range")
-        np.testing.assert_allclose(beams[f"range_{k}"], np.where(ranges > 0, 0.01 * ranges, np.nan))
+        np.testing.assert_allclose(beams[f"distance_{k}"], np.where(ranges > 0, 0.01 * ranges, np.nan))
         np.testing.assert_array_equal(beams[f"correlation_{k}"], of(f"bt_beam{k}_correlation"))
+        assert f"percent_good_{k}" in beams and f"velocity_{k}" not in beams  # per beam; in ship axes
     ntp = 2_208_988_800.0  # its times count from 1900
     np.testing.assert_allclose(beams["time"], of("internal_timestamp") - ntp, atol=1e-3)
 
@@ -415,6 +426,73 @@ def test_an_ad2cp_file_agrees_with_its_makers_own_decoding():
     depth = first(recording, "depth").columns["depth"]
     np.testing.assert_allclose(depth * 9806.65, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
     assert not first(recording, "dvl").columns["dvl_valid"].any()  # on a bench: figures of merit are none
+    assert (made["BottomTrack_VelZ1"] < -11.0).all()  # stale, and refused
+    assert "dvl_beams" not in recording.tables
+    sound = first(recording, "dvl_sound").columns
+    np.testing.assert_allclose(sound["dvl_sound_speed"], made["BottomTrack_Soundspeed"], atol=1e-3)
+    np.testing.assert_allclose(sound["water_temperature"], made["BottomTrack_Temperature"], atol=1e-3)
+
+
+def test_a_signatures_profile_is_that_of_its_beams_by_the_makers_own_matrix():
+    path = DATA / "adcp_bt" / "VelEchoBT01.mat.gz"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    with gzip.open(path) as file:
+        made = loadmat(file, simplify_cells=True)
+    x, y, z1, z2 = made["Config"]["Burst_Beam2xyz"]
+    directions = np.linalg.pinv(np.array([x, y, 0.5 * (z1 + z2)]))
+    away = np.stack([made["Data"][f"Burst_VelBeam{k}"] for k in (1, 2, 3, 4)], axis=-1).reshape(-1, 4).astype(float)
+    of_maker = [made["Data"][f"Burst_Vel{axis}"].astype(float) for axis in ("X", "Y", "Z1", "Z2")]
+    expected = np.column_stack([v.ravel() for v in (*of_maker[:2], 0.5 * (of_maker[2] + of_maker[3]))])
+    found, _ = velocity_by_beams(directions, away, np.isfinite(away))
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6)
+    preset = parse_config("dvl: {preset: nortek-signature}").dvl
+    found, _ = velocity_by_beams(beam_geometry(preset).directions, away, np.isfinite(away))
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-4)  # the matrix has five digits
+
+
+def solved(name: str) -> tuple[Log, np.ndarray]:
+    """A file's log, and velocities by its beams and the geometry that it states."""
+    if not (DATA / name).exists():
+        pytest.skip(f"{DATA / name} is not there")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        made = convert([DATA / name])
+    geometry = beam_geometry(made.completed.dvl)
+    beams = beams_of(made.log["dvl_beams"].data, geometry.numbers)
+    return made.log, velocity_by_beams(geometry.directions, beams.velocity, beams.valid)[0]
+
+
+def test_beams_of_a_ship_give_the_velocity_that_the_formula_does():
+    log, found = solved("glider_pd0/dolfyn_vmdas02_os.ENR.gz")
+    own = log["dvl"].data
+    # of the first ping by hand: 1 / (2 sin 30 deg), 1 / (4 cos 30 deg)
+    b1, b2, b3, b4 = -0.049, 0.052, 0.037, -0.031
+    first_ping = [b3 - b4, b2 - b1, (b1 + b2 + b3 + b4) / (4.0 * np.cos(np.deg2rad(30.0)))]
+    np.testing.assert_allclose(own[0, :3], first_ping, rtol=0.0, atol=1e-12)
+    whole = (own[:, 3] == 1.0) & np.isfinite(found).all(axis=1)
+    assert whole.sum() > 200
+    np.testing.assert_allclose(found[whole], own[whole, :3], rtol=0.0, atol=1e-12)
+
+
+def test_a_river_boats_beams_agree_with_its_satellite_receiver():
+    log, found = solved("adcp_bt/RiverPro_test01.PD0.gz")
+    fix, pings = log["fix"], log["dvl_beams"]
+    span = 2.0  # seconds on both sides
+    over = [
+        [np.interp(pings.time + s, fix.time, fix[f"fix_{axis}"]) for s in (-span, span)] for axis in ("north", "east")
+    ]
+    speed = np.hypot(*(after - before for before, after in over)) / (2.0 * span)
+    ratio = (np.linalg.norm(found[:, :2], axis=1) / speed)[speed > 0.3]
+    assert len(ratio) > 100
+    assert np.nanmedian(ratio) == pytest.approx(1.005, abs=0.02)
+
+
+def test_percentages_of_kinds_of_solution_are_not_called_those_of_beams():
+    beams = real("adcp_bt/winriver02.PD0.gz").tables["dvl_beams"]
+    names = "percent_three_beam", "percent_rejected", "percent_beams_bad", "percent_four_beam"
+    np.testing.assert_array_equal(sum(beams[name] for name in names), 100.0)
+    assert "percent_good_1" not in beams
 
 
 def test_a_tracker_650_is_read_with_and_without_checksums(tmp_path):

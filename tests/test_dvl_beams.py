@@ -12,10 +12,12 @@ from wire import report
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.log.beams import beams_of, usable_beams
+from rovgraph.log.beams import beams_of_table, usable_beams
 from rovgraph.log.tables import table_of_arrays
+from rovgraph.model.config import Config
 from rovgraph.readers.merging import merge
 from rovgraph.readers.recording import Clock, Recording
+from rovgraph.sensors.dvl_beam import beams_of
 
 START = 1_750_000_000.0  # Unix time of the dive's start [s]
 UNIX, BOOT = Clock("Unix", 0.0, 0.0, "GPS"), Clock("boot")
@@ -95,15 +97,16 @@ def test_converted_beams_lie_beside_the_log_and_are_read_with_it(files, tmp_path
     out.mkdir()
     converted = rg.convert(files)
     assert out / "log.dvl_beams.csv" in converted.save(out / name)
-    assert "dvl_beams" not in converted.log.sensors
-    direct, written = rg.read_log(files).beams, rg.read_log(out / name).beams
+    direct, written = rg.read_log(files)["dvl_beams"], rg.read_log(out / name)["dvl_beams"]
     assert direct.columns == written.columns
-    assert direct.columns[:5] == ("valid_0", "valid_1", "valid_2", "valid_3", "range_0")
+    assert direct.columns[:3] == ("dvl_beam_valid_0", "dvl_beam_velocity_0", "dvl_beam_range_0")
     np.testing.assert_array_equal(written.data, direct.data)
     np.testing.assert_allclose(written.time, direct.time, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(written.time, rg.read_log(out / name)["dvl"].time)
-    assert written["valid_3"].mean() == pytest.approx(1 / 3, abs=0.01)
-    np.testing.assert_array_equal(np.isnan(written["range_3"]), written["valid_3"] == 0.0)
+    beams = beams_of(written.data)
+    assert beams.numbers == (0, 1, 2, 3)
+    assert beams.valid[:, 3].mean() == pytest.approx(1 / 3, abs=0.01)
+    np.testing.assert_array_equal(np.isnan(beams.range[:, 3]), ~beams.valid[:, 3])
 
 
 def test_beams_beside_a_log_stay_with_it_among_native_files(files, tmp_path):
@@ -112,8 +115,8 @@ def test_beams_beside_a_log_stay_with_it_among_native_files(files, tmp_path):
     (tmp_path / "track.gpx").write_text(
         f'<gpx version="1.1"><trk><trkseg>{_points(converted.log.start)}</trkseg></trk></gpx>', encoding="utf-8"
     )
-    beams = rg.read_log([tmp_path / "whole.csv", tmp_path / "track.gpx"]).beams
-    np.testing.assert_array_equal(beams.data, converted.log.beams.data)
+    beams = rg.read_log([tmp_path / "whole.csv", tmp_path / "track.gpx"])["dvl_beams"]
+    np.testing.assert_array_equal(beams.data, converted.log["dvl_beams"].data)
 
 
 def _points(start: float) -> str:
@@ -124,21 +127,20 @@ def _points(start: float) -> str:
 def test_a_known_latency_of_the_dvl_is_that_of_its_beams(files, tmp_path):
     config = rg.parse_config("{delay_s: {dvl: 0.25}}")
     log = rg.read_log(files, config)
-    np.testing.assert_array_equal(log.beams.time, log["dvl"].time)
-    np.testing.assert_allclose(log.beams.time, rg.read_log(files).beams.time - 0.25, rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(log["dvl_beams"].time, log["dvl"].time)
+    before = rg.read_log(files)["dvl_beams"].time
+    np.testing.assert_allclose(log["dvl_beams"].time, before - 0.25, rtol=0.0, atol=1e-6)
+    of_their_own = rg.read_log(files, rg.parse_config("{delay_s: {dvl: 0.25, dvl_beams: 0.1}}"))
+    np.testing.assert_allclose(of_their_own["dvl_beams"].time, before - 0.1, rtol=0.0, atol=1e-6)
 
 
 HOSTILE = {
     "no time": ("valid_1\n1\n", "no column time"),
     "no beam": ("time,depth\n1,2\n", "no column valid_1, velocity_1, range_1 or distance_1"),
-    "text": ("time,valid_1,range_1\n1,1,near\n", "line 2, column range_1: 'near' is not a number"),
-    "text as time": ("time,valid_1\nnoon,1\n", "line 2, column time: 'noon' is not a number"),
-    "a validity that is none": ("time,valid_1\n1,1\n2,0.5\n", "line 3, column valid_1: 0.5, expected 0 or 1"),
-    "another number of beams": ("time,valid_1,valid_2,range_1\n1,1,1,2\n", "has valid_2 and no range_2"),
-    "too many": (
-        "time," + ",".join(f"valid_{k}" for k in range(9)) + "\n1" + 9 * ",1" + "\n",
-        "has 9 beams, expected at",
-    ),
+    "text": ("time,valid_1,range_1\n1,1,near\n", "column dvl_beam_range_1: 'near' is not a number"),
+    "text as time": ("time,valid_1\nnoon,1\n", "line 2, column time: 'noon' is neither seconds nor a date"),
+    "a validity that is none": ("time,valid_1\n1,1\n2,0.5\n", "line 3, column dvl_beam_valid_1: 0.5, expected 0 or 1"),
+    "a number beyond the last": ("time,valid_1,valid_9\n1,1,1\n", "column valid_9: beams are numbered 0 to 8"),
     "twice": ("time,valid_1,valid_1\n1,1,1\n", "has the column 'valid_1' twice"),
     "no row": ("time,valid_1\n", "no rows below it"),
     "no row with a time": ("time,valid_1\n,1\n", "column time is empty"),
@@ -157,13 +159,19 @@ def test_beams_that_cannot_be_used_are_left_out_with_one_warning(files, tmp_path
         log = rg.read_log(tmp_path / "log.csv")
     texts = [str(each.message) for each in warned if "beams are left out" in str(each.message)]
     assert len(texts) == 1 and said in texts[0] and "\n" not in texts[0]
-    assert log.beams is None and texts[0] in log.warnings and "dvl" in log
+    assert "dvl_beams" not in log and texts[0] in log.warnings and "dvl" in log
 
 
 def test_rows_of_beams_without_a_time_are_left_out_and_the_others_put_in_order():
-    beams = usable_beams({"time": [3.0, np.nan, 1.0], "valid_1": [1.0, 1.0, 0.0], "distance_1": [2.0, 2.0, 2.0]})
-    np.testing.assert_array_equal(beams.time, [1.0, 3.0])
-    np.testing.assert_array_equal(beams.data, [[0.0, np.nan], [1.0, 2.0]])
+    time = START + np.arange(20.0)
+    time[[3, 4, 7]] = time[4], time[3], np.nan
+    table = {"time": time, "valid_1": (np.arange(20) != 4).astype(float), "distance_1": np.full(20, 2.0)}
+    with pytest.warns(rg.DataWarning, match=r"rows without time left out|rows are earlier"):
+        stream = usable_beams(table, Config(), "beams")
+    beams = beams_of(stream.data)
+    np.testing.assert_array_equal(stream.time, np.delete(START + np.arange(20.0), 7))
+    np.testing.assert_array_equal(beams.valid[:, 0], np.arange(19) != 3)
+    np.testing.assert_array_equal(beams.distance[:4, 0], [2.0, 2.0, 2.0, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -171,14 +179,18 @@ def test_rows_of_beams_without_a_time_are_left_out_and_the_others_put_in_order()
     [
         ({"valid_1": [1, 0, np.nan], "velocity_1": [np.nan, 1, 1], "range_1": [2, 2, 2]}, [1, 0, 0]),
         ({"velocity_1": [np.nan, 0, 1], "range_1": [2, 2, np.nan]}, [0, 1, 1]),
-        ({"range_1": [2, np.nan, 2], "correlation_1": [9, 9, 9], "error_velocity": [0, 0, 0]}, [1, 0, 1]),
+        (
+            {"range_1": [2, np.nan, 2], "correlation_1": [9, 9, 9], "error_velocity": [0, 0, 0]},
+            [1, 1],
+        ),  # a row of nothing is left out
     ],
 )
 def test_a_beam_is_valid_where_it_is_said_else_by_its_velocity_else_by_its_range(columns, valid):
-    beams = beams_of(table_of_arrays([{"time": [1.0, 2.0, 3.0], **columns}], "time", "beams"))
-    np.testing.assert_array_equal(beams["valid_1"], valid)
+    table = table_of_arrays([{"time": [1.0, 2.0, 3.0], **columns}], "time", "beams")
+    beams = beams_of(beams_of_table(table, Config()).data)
+    np.testing.assert_array_equal(beams.valid[:, 0], valid)
 
 
 def test_arrays_of_different_length_are_no_table():
     with pytest.raises(InputError, match="columns of different length"):
-        beams_of(table_of_arrays([{"time": [1.0, 2.0], "valid_1": [1.0]}], "time", "beams"))
+        beams_of_table(table_of_arrays([{"time": [1.0, 2.0], "valid_1": [1.0]}], "time", "beams"), Config())

@@ -15,12 +15,14 @@ import rovgraph as rg
 from rovgraph.api.reporting import report
 from rovgraph.cli.app import main
 from rovgraph.log.beams import usable_beams
+from rovgraph.model.config import Config
 from rovgraph.report.pages import printing
 from rovgraph.report.pages.page import Panel, Section, broken, extremes, line, packed, render
 from rovgraph.report.pages.reporting import page_of
 from rovgraph.report.pages.sensors import autocorrelation, valid_share
 from rovgraph.report.pages.source import PageTrack
 from rovgraph.report.pages.uncertainty import falls, separation
+from rovgraph.sensors.dvl_beam import beams_of
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & <b>δύτης 潜水</b>"
 LIMIT = 4_000_000  # bytes of a page
@@ -410,11 +412,13 @@ def test_shares_of_valid_pings_stay_few_over_a_long_dive_and_know_where_there_is
     time = np.arange(0.0, 36_000.0, 0.2)
     time = time[(time < 9000.0) | (time > 18_000.0)]
     valid = (time > 26_999.9).astype(float)
-    edges, share = valid_share(usable_beams({"time": time, "valid_0": valid, "valid_7": 1.0 - valid}), 0.0, 36_000.0)
+    stream = usable_beams({"time": time, "valid_0": valid, "valid_7": 1.0 - valid}, Config(), "beams")
+    edges, share = valid_share(stream.time, beams_of(stream.data), 0.0, 36_000.0)
     assert share.shape == (len(edges) - 1, 2) == (240, 2)
     np.testing.assert_array_equal(np.isnan(share).all(axis=1), (edges[:-1] >= 9000.0) & (edges[:-1] < 18_000.0))
     np.testing.assert_array_equal(share[180:], [[100.0, 0.0]] * 60)
-    edges, share = valid_share(usable_beams({"time": [5.0], "valid_1": [1.0]}), 5.0, 5.0)
+    stream = usable_beams({"time": [5.0], "valid_1": [1.0]}, Config(), "beams")
+    edges, share = valid_share(stream.time, beams_of(stream.data), 5.0, 5.0)
     np.testing.assert_array_equal(share, [[100.0]])
 
 

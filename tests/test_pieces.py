@@ -256,7 +256,7 @@ def test_beams_of_pieces_are_one_table(dive, tmp_path):
         table = pd.DataFrame({"time": pings["time"], "valid_1": 1, "velocity_1": 0.5, "range_1": 3.0})
         csv(tmp_path, f"{path.stem}.dvl_beams.csv", table)
     log = quietly(*files)
-    assert log.beams is not None and len(log.beams) == len(log["dvl"])
+    assert len(log["dvl_beams"]) == len(log["dvl"])
 
 
 def test_results_do_not_take_a_piece_for_an_output(dive, tmp_path, monkeypatch, capsys):

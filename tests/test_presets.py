@@ -9,7 +9,7 @@ import pytest
 from rovgraph.cli.logs import preset_tables
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.model.config import Config, describe, load_config, parse_config
-from rovgraph.model.presets import TRIPLES, UNITS, Preset, presets
+from rovgraph.model.presets import LISTS, TRIPLES, UNITS, Fact, Preset, presets
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,23 +50,38 @@ def test_every_preset_reaches_the_configuration_with_a_source_for_each_number(pr
     for fact in preset.facts:
         assert fact.key in keys and fact.source.strip()
         assert leaf(config, fact.key) == fact.value
-        assert isinstance(fact.value, tuple) == (fact.key in TRIPLES)
+        assert isinstance(fact.value, tuple) == (fact.key in (*TRIPLES, *LISTS))
 
 
 def test_a_preset_without_numbers_says_so_and_changes_nothing() -> None:
-    assert presets()["waterlinked-a125"].facts == ()
-    config = parse_config("dvl: {preset: waterlinked-a125}")
+    assert presets()["sontek-3-beams"].facts == ()
+    config = parse_config("dvl: {preset: sontek-3-beams}")
     assert config.changed(dvl={"preset": None}) == Config()
     assert "| nothing | fills in nothing: " in preset_tables()
     assert "70 mm above" in preset_tables()
 
 
+def test_a_preset_says_where_the_beams_of_a_dvl_point() -> None:
+    assert parse_config("dvl: {preset: waterlinked-a50}").dvl.beams.azimuth_deg == (135.0, 225.0, 315.0, 45.0)
+    assert parse_config("dvl: {preset: waterlinked-a50}").dvl.beams.first_number == 0
+    pathfinder = parse_config("dvl: {preset: teledyne-pathfinder, beams: {angle_deg: 29.9}}").dvl.beams
+    assert (pathfinder.angle_deg, pathfinder.phased, pathfinder.azimuth_deg[2]) == (29.9, True, 0.0)
+    assert not parse_config("dvl: {preset: nortek-dvl1000}").dvl.beams.azimuth_deg  # no source: it is fitted
+
+
+def _own(fact: Fact) -> object:
+    """Another value than the preset's."""
+    others = {"dvl.beams.azimuth_deg": [10.0, 130.0, 250.0], "dvl.beams.first_number": 1 - int(fact.value == 1)}
+    others |= {key: [0.5, 0.6, 0.7] for key in TRIPLES} | {"dvl.beams.phased": False}
+    return others.get(fact.key, 0.5)
+
+
 @pytest.mark.parametrize("preset", presets().values(), ids=presets().keys())
 def test_what_the_user_states_takes_precedence(preset: Preset) -> None:
     for fact in preset.facts:
-        own = [0.5, 0.6, 0.7] if fact.key in TRIPLES else 0.5
+        own = _own(fact)
         section, *path = fact.key.split(".")
-        text = f"{section}: " + "".join(f"{{{p}: " for p in path) + str(own) + "}" * len(path)
+        text = f"{section}: " + "".join(f"{{{p}: " for p in path) + str(own).lower() + "}" * len(path)
         if section == preset.kind:
             text = text.replace("{", f"{{preset: {preset.name}, ", 1)
         else:

@@ -121,7 +121,8 @@ def test_mountings_and_lever_arms_come_from_a_chain_of_static_transforms(tmp_pat
         transform("/base_link", "imu_link", (0, 0, half, half), at=(0.05, 0, 0)),  # x to port
     ]
     recording = read(tmp_path, imus(), [marine_dvl(0.1 * k, (0.5, 0, 0)) for k in range(8)], frames)
-    assert recording.settings["dvl"] == {"mount_rpy_deg": [0.0, 0.0, 0.0], "lever_arm_m": [0.1, -0.2, 0.2]}
+    mounting = {"mount_rpy_deg": [0.0, 0.0, 0.0], "lever_arm_m": [0.1, -0.2, 0.2]}
+    assert recording.settings["dvl"] == mounting | {"sound_speed_set_mps": 1500.0}
     assert recording.settings["imu"]["lever_arm_m"] == [0.05, 0.0, 0.0]
     R_bs = matrix_from_rpy(np.deg2rad(recording.settings["imu"]["mount_rpy_deg"]))
     close(R_bs @ [1, 0, 0], [0, -1, 0], atol=1e-6)
@@ -346,3 +347,27 @@ def test_a_message_that_claims_four_gigabytes_is_counted(tmp_path):
     assert len(first(recording, "imu").columns["time"]) >= 39
     assert sum(left(recording).values()) <= 1
     shutil.rmtree(path)
+
+
+def test_beams_of_a_dvl_point_where_its_messages_say(tmp_path):
+    """Velocities along four beams of 25 deg; where none is valid, only ranges are known."""
+    around = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+    d = np.column_stack([np.sin(np.deg2rad(25.0)) * np.cos(around), np.sin(np.deg2rad(25.0)) * np.sin(around)])
+    d = np.column_stack([d, np.full(4, np.cos(np.deg2rad(25.0)))])
+    v = np.array([0.5, -0.1, 0.02])
+    said = {"beam_unit_vec": [xyz(*each) for each in d], "beam_velocity_covar": np.full(4, 1e-4, np.float32)}
+    sent = []
+    for k in range(50):
+        one = marine_dvl(0.2 * k, v)
+        moves = {"beam_velocities_valid": k != 3, "beam_velocity": (d @ v).astype(np.float32)}
+        sent.append(one._replace(fields={**one.fields, **said, **moves}))
+    recording = read(tmp_path, sent)
+    beams = recording.settings["dvl"]["beams"]
+    assert beams["angle_deg"] == pytest.approx(25.0)
+    assert beams["azimuth_deg"] == pytest.approx([45.0, 135.0, 225.0, 315.0])
+    assert recording.settings["dvl"]["sound_speed_set_mps"] == 1500.0
+    (channel,) = (c for c in recording.channels if c.sensor == "dvl_beams")
+    np.testing.assert_allclose(channel.columns["dvl_beam_velocity_2"][0], d[1] @ v, atol=1e-7)
+    np.testing.assert_allclose(channel.columns["dvl_beam_sd_2"][0], 0.01, rtol=1e-6)
+    assert np.isnan(channel.columns["dvl_beam_velocity_2"][3]) and channel.columns["dvl_beam_range_2"][3] == 2.6
+    assert channel.columns["dvl_beam_valid_1"][3] == 1.0

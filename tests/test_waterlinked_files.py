@@ -85,7 +85,7 @@ def test_pings_without_lock_beams_and_the_dvls_own_position_are_kept_as_what_the
     beams = recording.tables["dvl_beams"]
     close(beams["time"], dvl["time"])
     for number in range(4):
-        close(beams[f"distance_{number}"], [1.6] * 3)
+        close(beams[f"range_{number}"], [1.6] * 3)  # along the beam, although the report calls it a distance
         np.testing.assert_array_equal(beams[f"valid_{number}"], [1, 1, 1])
     close(recording.tables["dvl_position"]["yaw"], np.pi / 2)
     assert recording.notes == ("the DVL's settings: mounting_rotation_offset 45.0",)

@@ -1,8 +1,8 @@
 """For researchers: the work of ``rovgraph study``, ``compare``, ``observe``, ``plan`` and ``calibrate``.
 
 `study_misalignment` runs many simulated dives, `compare` sets estimators against each other, `observe` and `plan`
-examine the observability of the calibration, and `calibrate_magnetometer` and `calibrate_noise` make a piece of
-configuration from a log of their own.
+examine the observability of the calibration, and `calibrate_magnetometer`, `calibrate_noise` and `calibrate_dvl_beams`
+make a piece of configuration from a log of their own.
 """
 
 import time
@@ -19,7 +19,7 @@ from rovgraph.inference.trajectory import Trajectory
 from rovgraph.lab import calibrate as library
 from rovgraph.lab import compare as comparisons
 from rovgraph.lab import executors
-from rovgraph.lab.calibrate import MagnetometerCalibration, NoiseReport
+from rovgraph.lab.calibrate import BeamFit, MagnetometerCalibration, NoiseReport
 from rovgraph.lab.choices import goals as read_goals
 from rovgraph.lab.choices import listed, read_known
 from rovgraph.lab.compare import Comparison
@@ -455,6 +455,25 @@ def calibrate_noise(log: Log, config: Config | None = None) -> NoiseResult:
     """
     config = config_of(log, config)
     return NoiseResult(library.calibrate_noise(log, config), config)
+
+
+def calibrate_dvl_beams(log: Log, config: Config | None = None) -> BeamFit:
+    """Determine where the beams of a DVL point, from a log with velocities along them and along the DVL's axes.
+
+    Parameters
+    ----------
+    log : as read with the configuration; the vehicle moves forward and sideways in it
+    config : of vehicle and sensors; None = all defaults
+
+    Returns
+    -------
+    BeamFit : ``angle_deg``, ``azimuth_deg``, their sds and the residual; ``to_yaml()`` for a configuration
+
+    Raises
+    ------
+    InputError : no beams or no velocity, or a dive that does not show where they point
+    """
+    return library.calibrate_dvl_beams(log, config_of(log, config))
 
 
 def _completed(config: Config, log: Log) -> Config:

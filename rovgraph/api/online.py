@@ -349,8 +349,10 @@ class Online:
         config = config_of(log, self.config)
         if config.imu.mag != Mag():  # its prior is that of a calibrated one, which the log's samples are
             config = with_priors_stated(config, names=("hard_iron",))
+        if config.knows_sound_speed:  # so do the log's velocities
+            config = with_priors_stated(config, names=("dvl_scale",))
         delays = {} if log.config is None else log.config.delay_s
-        config = config.with_raw_magnetometer().model_copy(update={"delay_s": delays})  # the log holds the field
+        config = config.as_recorded().model_copy(update={"delay_s": delays})  # the log holds the field
         feed = Feed([LogReplay(log.source, _as_it_arrived(log, delays), AS_FAST_AS_POSSIBLE)])
         session = Session(self._navigator(config, patient=True, trust=True), [], Warnings(), self.rate_hz or RATE_HZ)
         yield from LiveRun((log.source,), session, feed, ())

@@ -356,7 +356,8 @@ def misalignment(
 
 
 calibrate = typer.Typer(
-    help="Calibrate the magnetometer, or determine the noise of sensors at rest.", no_args_is_help=True
+    help="Calibrate the magnetometer, determine the noise of sensors at rest, or where the beams of a DVL point.",
+    no_args_is_help=True,
 )
 
 LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
@@ -418,6 +419,18 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     for line in result.found.remarks:
         say(shown, f"note: {line}")
     say(shown, f"for the configuration: {out / 'noise.yaml'}")
+
+
+@calibrate.command()
+def dvl_beams(log: LogPath, config: ConfigPath = None) -> None:
+    """Determine where the beams of a DVL point, and print it for the configuration.
+
+    Example: rovgraph calibrate dvl-beams log.csv >> vehicle.yaml
+    """
+    import rovgraph as rg
+
+    settings = rg.load_config(config)
+    typer.echo(rg.calibrate_dvl_beams(rg.read_log(log, settings), settings).to_yaml(), nl=False)
 
 
 def _magnetometer_table(found: "MagnetometerCalibration") -> "Table":

@@ -187,7 +187,7 @@ def _preset_lines() -> Iterator[str]:
     for preset in known().values():
         yield f"{preset.kind}: {{preset: {preset.name}}}    {preset.instrument}"
         for fact in preset.facts:
-            value = fact.value if isinstance(fact.value, float) else fact.value[0]
+            value = fact.value[0] if isinstance(fact.value, tuple) else fact.value
             yield f"    {fact.key:26} {value:<10.4g} {fact.stated}"
             yield f"        {fact.source}"
         yield from (f"    {note}" for note in preset.notes)

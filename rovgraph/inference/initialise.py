@@ -33,6 +33,7 @@ from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_
 from rovgraph.kernels.assembly import NOISIER
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import CLEAR_SPEED
+from rovgraph.log.reading import water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.state import POSE, Jacobians, State
@@ -41,6 +42,7 @@ from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors.dvl_sound import SoundCorrection
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
@@ -488,6 +490,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     config = _resolve_noise(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams}
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
+    config = _resolve_sound(log, config, assumptions)
     config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)
     elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
@@ -603,6 +606,33 @@ def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
         return config
     imu_section = config.imu.model_copy(update={"noise": noise.model_copy(update=changes)})
     return config.model_copy(update={"imu": imu_section})
+
+
+def _resolve_sound(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Say how the DVL was corrected for the speed of sound; where it was not, its scale keeps its wide prior."""
+    stream = next((log[sensor] for sensor in ("dvl", BEAMS, "dvl_water") if sensor in log), None)
+    if not config.knows_sound_speed or stream is None:
+        return config
+    worked_with, true = SoundCorrection(config).speeds(water_at(stream.time, log.streams))
+    ratio = true / worked_with
+    if np.isfinite(ratio).all():
+        what = "vertical velocities" if config.dvl.beams.phased else "velocities"
+        assumptions.append(
+            f"speed of sound {_span(true, 0)} m/s, the DVL worked with {_span(worked_with, 0)}: its {what} and ranges "
+            f"are multiplied by {_span(ratio, 3)}"
+        )
+        return config
+    lacking = "water_temperature" if np.isfinite(worked_with).all() else "dvl_sound_speed"
+    assumptions.append(
+        f"the DVL is not corrected for the speed of sound: the log has no {lacking}; state dvl.sound_speed_mps and "
+        "dvl.sound_speed_set_mps"
+    )
+    return config.model_copy(update={"dvl": config.dvl.model_copy(update={"sound_speed_set_mps": None})})
+
+
+def _span(values: Array, digits: int) -> str:
+    low, high = (f"{v:.{digits}f}" for v in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def _attitude(

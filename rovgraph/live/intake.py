@@ -26,6 +26,7 @@ from rovgraph.model.config import Config, Mag
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
+from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.instruments import instruments
 
 _STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship"}  # where a reading goes by another name
@@ -84,6 +85,7 @@ class Intake:
         self.origin = config.environment.origin
         self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
+        self._sound, self._water = SoundCorrection(config), np.full(3, np.nan)  # in the order of `WaterState`
         self._left_out = left_out
         self._newest: dict[tuple[str | float, ...], float] = {}  # by sensor, and beacon or place
         self._name_columns: dict[str, list[int]] = {}  # of each sensor
@@ -114,6 +116,8 @@ class Intake:
             self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
+        elif self._sound.applies:
+            values = self._by_sound_speed(sensor, values)
         if sensor in ACOUSTICS and self._is_unplaced(sensor, values):
             return None
         size = len(values)
@@ -180,6 +184,17 @@ class Intake:
     def calibrated(self, field: Array) -> Array:
         """A sample of the magnetometer, shape (3,), as the configuration's calibration has it."""
         return field if self._mag is None else self._mag.calibrated(field[None])[0]
+
+    def _by_sound_speed(self, sensor: str, values: Array) -> Array:
+        """Values of a DVL as if it had known the speed of sound; of others, what they tell of the water is kept."""
+        if sensor == "depth":
+            self._water[2] = values[0]
+        elif sensor == "dvl_sound":
+            self._water[:2] = np.where(np.isfinite(values), values, self._water[:2])
+        elif sensor in CORRECTED:
+            water = WaterState(self._water[:1], self._water[1:2], self._water[2:])
+            return np.asarray(self._sound.applied(sensor, values[None], water)[0])
+        return values
 
     def geodetic(self, p_n: Array) -> tuple[float | None, float | None]:
         """Latitude and longitude [deg] of a position, shape (3,), where the origin is known."""

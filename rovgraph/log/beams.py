@@ -53,7 +53,7 @@ def beams_of_table(table: Table, config: Config) -> Stream:
         )
     kept = ["time", *named, *mapped.values()]
     frame = table.frame[[name for name in table.names if name in kept]].rename(columns=named)
-    own = config.model_copy(update={"columns": mapped, "delay_s": {BEAMS: delay_of(config, BEAMS)}})
+    own = config.as_recorded().model_copy(update={"columns": mapped, "delay_s": {BEAMS: delay_of(config, BEAMS)}})
     streams, _ = read_streams([replace(table, frame=frame)], own, table.source)
     return streams[BEAMS]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from rovgraph.errors import InputError, collected_warnings, warn
 from rovgraph.log.beams import beams_beside
-from rovgraph.log.reading import read_streams
+from rovgraph.log.reading import read_streams, with_sound_speed
 from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
@@ -99,8 +99,8 @@ class Log:
         """The log as a data frame, one row per measurement in the order of time: the inverse of `from_frame`.
 
         Columns and units are rovgraph's own (docs/log-format.md), times are those of the measurements: ``columns``,
-        ``units``, ``delay_s`` and ``imu.mag`` of the configuration are applied already. So read it again with a
-        configuration without them. Positions are north and east of `origin`.
+        ``units``, ``delay_s``, ``imu.mag`` and ``dvl.sound_speed_set_mps`` of the configuration are applied already. So
+        read it again with a configuration without them. Positions are north and east of `origin`.
 
         Returns
         -------
@@ -165,7 +165,7 @@ class Log:
 
         Parameters
         ----------
-        beams : of `rovgraph.log.beams`, by the log's clock; None = not known
+        beams : of `rovgraph.log.beams`, by the log's clock, as the DVL gave them; None = not known
 
         Warns
         -----
@@ -173,9 +173,11 @@ class Log:
         """
         if beams is None:
             return self
+        config = config_or_defaults(self.config)
         first, last = float(beams.time[0]), float(beams.time[-1])
         if first <= self.end and last >= self.start:
-            return replace(self, streams={**self.streams, BEAMS: beams})
+            found = {BEAMS: beams}
+            return replace(self, streams={**self.streams, **found, **with_sound_speed(found, self.streams, config)})
         with collected_warnings() as texts:
             warn(
                 f"{self.source}: the DVL's beams have times from {first:.1f} to {last:.1f} s, the log from "
@@ -192,7 +194,8 @@ class Log:
         """
         if self.config is None:
             return
-        for key in ("columns", "units", "angles", "times", "files", "delay_s", "imu.mag", "environment.origin"):
+        tables = "columns", "units", "angles", "times", "files", "delay_s"
+        for key in (*tables, "imu.mag", "environment.origin", "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
                     f"{self.source}: was read with another value of {key} than the configuration has; "

@@ -46,6 +46,7 @@ from rovgraph.log.units import (
 from rovgraph.model.config import Config, TableSettings
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
@@ -94,7 +95,43 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
     for sensor in found:
         if delay := delay_of(config, sensor):
             found[sensor] = replace(found[sensor], time=found[sensor].time - delay)
-    return found, origin
+    return found | with_sound_speed(found, found, config), origin
+
+
+def with_sound_speed(of_dvl: Mapping[str, Stream], streams: Mapping[str, Stream], config: Config) -> dict[str, Stream]:
+    """Streams of a DVL, made as if it had known the speed of sound.
+
+    Parameters
+    ----------
+    of_dvl : those that may be of a DVL
+    streams : of the whole log, with depths and temperatures
+    """
+    correction = SoundCorrection(config)
+    if not correction.applies:
+        return {}
+
+    out = {}
+    for sensor in CORRECTED:
+        if (stream := of_dvl.get(sensor)) is not None:
+            data = correction.applied(sensor, stream.data, water_at(stream.time, streams))
+            out[sensor] = replace(stream, data=data)
+    return out
+
+
+def water_at(time: Array, streams: Mapping[str, Stream]) -> WaterState:
+    """What a log has newest of the water at some times, shape (n,), or at first."""
+
+    def newest(sensor: str, column: str) -> Array:
+        stream = streams.get(sensor)
+        known = np.zeros(0, int) if stream is None else np.flatnonzero(np.isfinite(stream[column]))
+        if stream is None or not len(known):
+            return np.full(len(time), np.nan)
+        at = np.searchsorted(stream.time[known], time, side="right") - 1
+        return np.asarray(stream[column][known[np.maximum(at, 0)]])
+
+    return WaterState(
+        newest("dvl_sound", "dvl_sound_speed"), newest("dvl_sound", "water_temperature"), newest("depth", "depth")
+    )
 
 
 def delay_of(config: Config, sensor: str) -> float:

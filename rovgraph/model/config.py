@@ -389,8 +389,15 @@ class Config(ConfigSection):
         return self.model_copy(update={"imu": self.imu.model_copy(update={"mag": Mag()})})
 
     def as_recorded(self) -> "Config":
-        """The same for a log whose samples and stamps are taken as they are: without delays, too."""
-        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}})
+        """The same for a log whose samples and stamps are taken as they are: without delays and speed of sound, too."""
+        dvl = self.dvl.model_copy(update={"sound_speed_set_mps": None})
+        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}, "dvl": dvl})
+
+    @property
+    def knows_sound_speed(self) -> bool:
+        """Whether the DVL's velocities are made by the speed of sound in the water."""
+        true = self.dvl.sound_speed_mps, self.sound.profile, self.sound.salinity_psu
+        return self.dvl.sound_speed_set_mps is not None and any(known is not None for known in true)
 
 
 def register_settings(sensor: str, settings: type[SensorSettings], calibration: Sequence[Variable]) -> None:
@@ -442,7 +449,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
         stated, walk = getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
-        sd = variable.sd if stated is None else unit * stated
+        sd = unit * stated if stated is not None and not _sd_follows(name, config) else _usual_sd(name, config)
         lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
@@ -473,6 +480,19 @@ def beliefs(config: Config) -> dict[str, Belief]:
     return out
 
 
+KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
+
+
+def _sd_follows(name: str, config: Config) -> bool:
+    """Whether the sd of a prior is not stated and follows from what is known of the sound in the water."""
+    scale = config.calibration.dvl_scale  # type: ignore[attr-defined]
+    return name == "dvl_scale" and config.knows_sound_speed and "sd" not in scale.model_fields_set
+
+
+def _usual_sd(name: str, config: Config) -> float:
+    return KNOWN_SOUND_SD if _sd_follows(name, config) else TABLE[name].sd
+
+
 def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
     """The configuration with the sds of priors that it leaves to the log.
 
@@ -486,8 +506,8 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     for name in TABLE if names is None else names:
         variable, entry = TABLE[name], getattr(given, name)
         key = "sd_deg" if variable.angular else "sd"
-        if getattr(entry, key) is None:
-            sd = (name in unchecked and variable.unchecked_sd) or variable.sd
+        if getattr(entry, key) is None or _sd_follows(name, config):
+            sd = (name in unchecked and variable.unchecked_sd) or _usual_sd(name, config)
             sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
             entries[name] = entry.model_copy(update={key: sd})
     return config.model_copy(update={"calibration": given.model_copy(update=entries)})

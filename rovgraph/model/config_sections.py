@@ -24,7 +24,18 @@ PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = (
-    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *(
+        "imu",
+        "mag",
+        "ahrs",
+        "vehicle_heading",
+        "vehicle_tilt",
+        "dvl",
+        "dvl_heading",
+        "dvl_altitude",
+        "dvl_water",
+        "dvl_sound",
+    ),
     *("dvl_beams", "depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
 )
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
@@ -148,6 +159,25 @@ class MotionSettings(ConfigSection):
     )
 
 
+def _in_water(mps: float) -> float:
+    """Refuses what is no speed of sound in water in m/s."""
+    low, high = 1300.0, 1700.0
+    if not low <= mps <= high:
+        feet = f"; if it is in ft/s, state {mps * 0.3048:.0f}" if low <= mps * 0.3048 <= high else ""
+        raise PydanticCustomError("in_water", f"expected a speed of sound from {low:g} to {high:g} m/s{feet}")
+    return mps
+
+
+InWater = Annotated[float, AfterValidator(_in_water)]
+LOGGED = "logged"  # the log has it, column dvl_sound_speed
+
+
+def _set_or_logged(mps: float | str) -> float | str:
+    if isinstance(mps, str) and mps != LOGGED:
+        raise PydanticCustomError("logged", "expected a speed in m/s, or logged")
+    return mps if isinstance(mps, str) else _in_water(mps)
+
+
 class DvlBeams(ConfigSection):
     """Where the beams of a DVL point, in its own axes (docs/beams.md)."""
 
@@ -195,6 +225,16 @@ class Dvl(ConfigSection):
         "auto",
         description="auto = a ping's beams where their geometry is known, but for what the instrument refused; "
         "beams = whatever is valid; velocity = as the instrument makes it of them",
+    )
+    sound_speed_set_mps: Annotated[float | str, AfterValidator(_set_or_logged)] | None = Field(
+        None,
+        description="speed of sound that the DVL worked with; logged = column dvl_sound_speed of the log; null = "
+        "unknown, so that nothing is corrected",
+    )
+    sound_speed_mps: InWater | None = Field(
+        None,
+        description="speed of sound at the DVL; null = by sound.profile, or by water_temperature of the log and "
+        "sound.salinity_psu",
     )
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is rejected; null = never")
@@ -278,21 +318,10 @@ class ShipSettings(ConfigSection):
     )
 
 
-def _in_water(mps: float) -> float:
-    """Refuses what is no speed of sound in water in m/s."""
-    low, high = 1300.0, 1700.0
-    if not low <= mps <= high:
-        feet = f"; if it is in ft/s, state {mps * 0.3048:.0f}" if low <= mps * 0.3048 <= high else ""
-        raise PydanticCustomError("in_water", f"expected a speed of sound from {low:g} to {high:g} m/s{feet}")
-    return mps
-
-
 class AcousticSettings(ConfigSection):
     """Keys that directions and ranges share."""
 
-    sound_speed_mps: Annotated[float, AfterValidator(_in_water)] = Field(
-        1500.0, description="speed of sound that ranges were made with, and travel times"
-    )
+    sound_speed_mps: InWater = Field(1500.0, description="speed of sound that ranges were made with, and travel times")
     stamp: Literal["reply", "transponder", "arrival"] = Field(
         "reply",
         description="what a stamp is the time of: the reply at the head, the question at the transponder, "
@@ -343,6 +372,9 @@ class Sound(ConfigSection):
         None,
         description="its speed by depth: rows of depth [m] and speed [m/s], or a CSV file with depth and sound_speed, "
         "or with depth, temperature and salinity",
+    )
+    salinity_psu: Annotated[float, Field(ge=0, le=42)] | None = Field(
+        None, description="salinity of the water, for the DVL's speed of sound by the water_temperature of a log"
     )
 
 

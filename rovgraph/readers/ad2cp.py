@@ -3,6 +3,7 @@
 import mmap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from rovgraph.readers.nortek import (
     water_channels,
     where_bits,
 )
-from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.readers.recording import Channel, Clock, Left, Recording, sound_of_dvl
 from rovgraph.readers.records import gathered, layout
 from rovgraph.readers.stamps import unix_of_calendar
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -31,7 +32,9 @@ SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
 ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 ENU, XYZ, BEAM = range(3)  # coordinates of a Signature's velocities
-BEAM_ANGLE = np.deg2rad(25.0)  # of a Signature, as its own transformation matrix has it
+BEAM_ANGLE_DEG = 25.0  # of a Signature, as its own transformation matrix has it
+AZIMUTHS_DEG = [0.0, 270.0, 180.0, 90.0]  # of its beams
+BEAM_ANGLE = np.deg2rad(BEAM_ANGLE_DEG)
 NO_MERIT = 65535  # figure of merit of a beam that heard nothing
 HAS_VELOCITY, HAS_DISTANCE, HAS_MERIT = 1 << 5, 1 << 8, 1 << 9
 OTHERS = {
@@ -41,11 +44,13 @@ OTHERS = {
 _HEAD = [("version", "u1", 0), ("offset", "u1", 1)]
 _DATE = "6u1"  # years since 1900, months since January, day, hour, minute, second
 SIGNATURE_FIELDS = layout(
-    *_HEAD, ("config", "<u2", 2), ("date", _DATE, 8), ("fraction", "<u2", 14), ("pressure", "<u4", 20),
+    *_HEAD, ("config", "<u2", 2), ("date", _DATE, 8), ("fraction", "<u2", 14), ("sound", "<u2", 16),
+    ("temperature", "<i2", 18), ("pressure", "<u4", 20),
     ("heading", "<u2", 24), ("pitch", "<i2", 26), ("roll", "<i2", 28), ("beams", "<u2", 30), ("scale", "i1", 60),
 )  # fmt: skip
 DVL_FIELDS = layout(
-    *_HEAD, ("date", _DATE, 6), ("fraction", "<u2", 12), ("status", "<u4", 20), ("pressure", "<f4", 32),
+    *_HEAD, ("date", _DATE, 6), ("fraction", "<u2", 12), ("status", "<u4", 20), ("sound", "<f4", 24),
+    ("temperature", "<f4", 28), ("pressure", "<f4", 32),
     ("beams", "4<f4", 36), ("distance", "4<f4", 52), ("merit", "4<f4", 68), ("velocity", "4<f4", 132),
     ("sd", "4<f4", 148), ("delay", "4<f4", 164),
 )  # fmt: skip
@@ -67,7 +72,7 @@ class AD2CP:
         found = find_records(content, AD2CP_FAMILIES, lambda done: options.progress(done, len(content)))
         channels: list[Channel] = []
         tables: dict[str, dict[str, Array]] = {}
-        notes = []
+        notes: list[str] = []
         signature, refused = decoded_signature(content, found)
         tracks = {SIGNATURE: signature} | {k: decoded_dvl(content, found, k) for k in (DVL_BOTTOM, DVL_WATER)}
         for kind, track in tracks.items():
@@ -77,16 +82,25 @@ class AD2CP:
                 channels += water_channels(track, f"water track {kind:#x}", CLOCK)
             else:
                 channels += bottom_channels(track, f"bottom track {kind:#x}", CLOCK)
-                tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = beam_table(track)
+                if table := beam_table(track):
+                    tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = table
         channels += _attitude(content, found)
         channels += _depth(content, found)
+        water, of_dvl = _sound(content, found)
+        channels += water
+        if np.isfinite(signature.beams).any():
+            of_dvl["beams"] = {"angle_deg": BEAM_ANGLE_DEG, "azimuth_deg": AZIMUTHS_DEG}
+        elif any("velocity_1" in table for table in tables.values()):
+            notes.append("where the beams of a Nortek DVL point is not stated: rovgraph calibrate dvl-beams fits it")
+        settings = {"dvl": of_dvl} if of_dvl else {}
         if not channels:
             raise InputError(f"{path}: holds no bottom track (records 0x17, 0x1B); the instrument has to record it")
         if any(channel.sensor == "depth" for channel in channels):
             notes.append(f"depth is pressure in fresh water ({FRESH:g} kg/m3) above the offset that the instrument has")
         return Recording(
             str(path), self.name, tuple(channels), {CLOCK: Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")},
-            tuple(_left(found, refused)), notes=tuple(notes), warnings=tuple(_warnings(found, refused, channels)),
+            tuple(_left(found, refused)), settings, tuple(notes),
+            tuple(_warnings(found, refused, channels)),
             tables=tables,
         )  # fmt: skip
 
@@ -128,10 +142,11 @@ def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[Norte
     velocity[turned] = _of_enu(velocity[turned], rpy[turned])
     known = system <= BEAM
     velocity[~known] = np.nan
+    beams = np.where((system == BEAM)[:, None], -raw, np.nan)
     time = _time(records["date"], records["fraction"])
     merit = np.where(heard, 1e-3 * parts["merit"], np.nan)
     distance = np.where(heard, 1e-3 * parts["distance"], np.nan)
-    track = NortekTrack(time, np.zeros(count), -velocity, empty[:, :3], distance, raw, merit)
+    track = NortekTrack(time, np.zeros(count), -velocity, empty[:, :3], distance, beams, merit)
     return track, int(np.count_nonzero(~known))
 
 
@@ -174,7 +189,7 @@ def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> Nortek
         delay=records["delay"][:, 0].astype(float),
         velocity=np.column_stack([velocity[:, :2], _either(velocity[:, 2:])]),
         sd=np.column_stack([sd[:, :2], _either(sd[:, 2:])]),
-        distance=where_bits(records["distance"], status, 4),
+        range=where_bits(records["distance"], status, 4),
         beams=where_bits(records["beams"], status, 0),
         merit=where_bits(records["merit"], status, 8),
     )
@@ -208,6 +223,17 @@ def _depth(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
             depth = to_pascal * records["pressure"].astype(float) / (FRESH * GRAVITY)
             time = _time(records["date"], records["fraction"])
             yield Channel("depth", {"time": time, "depth": depth}, f"bottom track {kind:#x}: pressure", "", CLOCK)
+
+
+def _sound(content: bytes | mmap.mmap, found: Records) -> tuple[list[Channel], dict[str, Any]]:
+    """Speed of sound and temperature, as `sound_of_dvl` has them."""
+    for kind, fields, speed, degree in ((DVL_BOTTOM, DVL_FIELDS, 1.0, 1.0), (SIGNATURE, SIGNATURE_FIELDS, 0.1, 0.01)):
+        records, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
+        if (records := records[there]).size:
+            sound, temperature = speed * records["sound"].astype(float), degree * records["temperature"].astype(float)
+            time = _time(records["date"], records["fraction"])
+            return sound_of_dvl(time, sound, temperature, f"bottom track {kind:#x}", CLOCK)
+    return [], {}
 
 
 def _left(found: Records, refused: int) -> Iterator[Left]:

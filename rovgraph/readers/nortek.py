@@ -34,8 +34,8 @@ class NortekTrack:
     delay : from there to the echo [s], ndarray, shape (n,)
     velocity : of the instrument, shape (n, 3); NaN = none [m/s]
     sd : figure of merit of each axis, shape (n, 3); NaN = none [m/s]
-    distance : to the bottom, shape (n, beams); NaN = none [m]
-    beams : velocity along each beam, shape (n, beams); NaN = none [m/s]
+    range : to the bottom along each beam, shape (n, beams); NaN = none [m]
+    beams : velocity along each beam, positive towards where it points, shape (n, beams); NaN = none [m/s]
     merit : figure of merit of each beam, shape (n, beams) [m/s]
     """
 
@@ -43,7 +43,7 @@ class NortekTrack:
     delay: Array
     velocity: Array
     sd: Array
-    distance: Array
+    range: Array
     beams: Array
     merit: Array
 
@@ -68,9 +68,9 @@ def bottom_channels(track: NortekTrack, name: str, clock: str) -> Iterator[Chann
     if np.isfinite(sd).any():
         columns["dvl_sd"] = np.where(valid, sd, np.nan)
     yield Channel("dvl", {"time": track.stamp, **columns}, f"{name}: {', '.join(columns)}", FRAME, clock)
-    seen = np.isfinite(track.distance)
+    seen = np.isfinite(track.range)
     if (any_ := seen.any(axis=1)).any():
-        mean = np.nansum(track.distance[any_], axis=1) / seen[any_].sum(axis=1)
+        mean = np.nansum(track.range[any_], axis=1) / seen[any_].sum(axis=1)
         yield Channel("dvl_altitude", {"time": track.stamp[any_], "dvl_altitude": mean}, f"{name}: distance", "", clock)
 
 
@@ -83,11 +83,13 @@ def water_channels(track: NortekTrack, name: str, clock: str) -> Iterator[Channe
 
 
 def beam_table(track: NortekTrack) -> dict[str, Array]:
-    """Measurements of each beam."""
-    of_beams = {"velocity": track.beams, "distance": track.distance, "fom": track.merit}
+    """Measurements of each beam, without velocities where they were turned into axes; {} = none."""
+    of_beams = {"velocity": track.beams, "range": track.range, "sd": track.merit}
+    if not np.isfinite(track.beams).any():
+        del of_beams["velocity"], of_beams["sd"]
     count = track.beams.shape[1]
     columns = {f"{name}_{k + 1}": values[:, k] for name, values in of_beams.items() for k in range(count)}
-    return {"time": track.stamp, **columns}
+    return {"time": track.stamp, **columns} if any(np.isfinite(c).any() for c in columns.values()) else {}
 
 
 def where_bits(values: Array, status: NDArray[np.integer], first: int) -> Array:

@@ -27,7 +27,7 @@ from rovgraph.readers.nortek import (
     water_channels,
     where_bits,
 )
-from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.readers.recording import Channel, Clock, Left, Recording, sound_of_dvl
 from rovgraph.readers.records import gathered, layout
 from rovgraph.sensors.dvl_beam import BEAMS
 
@@ -42,7 +42,8 @@ COMMON = layout(
     ("status", "<u4", 12),
 )  # fmt: skip
 TRACK = layout(
-    ("status", "<u4", 12), ("beams", "3<f4", 36), ("distance", "3<f4", 48), ("merit", "3<f4", 60),
+    ("status", "<u4", 12), ("sound", "<f4", 24), ("temperature", "<f4", 28), ("beams", "3<f4", 36),
+    ("distance", "3<f4", 48), ("merit", "3<f4", 60),
     ("velocity", "3<f4", 96), ("sd", "3<f4", 108), ("delay", "<f4", 120),
 )  # fmt: skip
 VALUES = {  # behind the offset that each record states
@@ -94,12 +95,18 @@ class Nucleus:
         if not channels:
             raise InputError(f"{path}: holds no measurement of a sensor; switch on the IMU, AHRS and bottom track data")
         settings: dict[str, Any] = {}
+        if len(records[BOTTOM].time):
+            values = records[BOTTOM].values
+            sound, temperature = (values[name].astype(float) for name in ("sound", "temperature"))
+            water, of_dvl = sound_of_dvl(records[BOTTOM].time, sound, temperature, "bottom track", clock.name)
+            channels, settings = (*channels, *water), {"dvl": of_dvl} if of_dvl else {}
         declination = records[AHRS].values["declination"]
         if len(declination) and np.isfinite(declination[0]) and declination[0]:
             settings["environment"] = {"declination_deg": round(float(declination[0]), 3)}
         mixed = stamped and not unix and any(flags.any() for flags in stamped)
         more = ["its clock was set meanwhile: stamps are of two clocks"] if mixed else []
-        tables = {BEAMS: beam_table(track_of(records[BOTTOM]))} if len(records[BOTTOM].time) else {}
+        beams = beam_table(track_of(records[BOTTOM]))
+        tables = {BEAMS: beams} if beams else {}
         return Recording(
             str(path), self.name, channels, {clock.name: clock}, tuple(_left(found, records)), settings,
             warnings=(*more, *_warnings(found, channels)), tables=tables,
@@ -132,7 +139,7 @@ def track_of(said: NucleusRecords) -> NortekTrack:
         delay=values["delay"].astype(float),
         velocity=where_bits(values["velocity"], status, 9),
         sd=where_bits(values["sd"], status, 12),
-        distance=where_bits(values["distance"], status, 3),
+        range=where_bits(values["distance"], status, 3),
         beams=where_bits(values["beams"], status, 0),
         merit=where_bits(values["merit"], status, 6),
     )

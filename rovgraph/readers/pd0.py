@@ -31,7 +31,7 @@ from rovgraph.readers.nmea_sentences import RANGE_SD_M, day_time, number
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import gathered, layout
 from rovgraph.readers.stamps import unix_of_calendar
-from rovgraph.readers.trdi import BEAM, CLOCK, EARTH, Attitude, Pings, forward_starboard_down, recording
+from rovgraph.readers.trdi import BEAM, CLOCK, EARTH, Attitude, BeamHead, Pings, forward_starboard_down, recording
 
 SYNC = b"\x7f\x7f"
 FIXED, VARIABLE, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0600, 0x2000
@@ -49,10 +49,13 @@ LAYOUTS = {
     ),
     VARIABLE: layout(
         ("date", "7u1", 4),  # year, month, day, hour, minute, second, hundredths
+        ("sound", "<u2", 14),  # speed that it worked with [m/s]
         ("depth", "<u2", 16),  # [dm]
         ("heading", "<u2", 18),  # [0.01 deg]
         ("pitch", "<i2", 20),
         ("roll", "<i2", 22),
+        ("salinity", "<u2", 24),  # as it was told [psu]
+        ("temperature", "<i2", 26),  # [0.01 deg C]
         ("century", "u1", 57),
     ),
     BOTTOM: layout(
@@ -183,6 +186,7 @@ ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 BAD = -32768
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
+THERMOMETER, COMPUTED_SOUND = 0b1, 0b100_0000  # the temperature does; the speed of sound follows from what is measured
 SEMICIRCLE = 180.0 / 2**31  # [deg]
 DAY_S = 86_400.0
 UTC = "UTC of the receiver"
@@ -460,7 +464,12 @@ def decoded(content: bytes | mmap.mmap, found: Ensembles) -> Pings:
         depth=0.1 * variable["depth"],
         range=np.where(ranges > 0.0, ranges, np.nan),
         beams=np.where((system == BEAM)[:, None], values, np.nan),
-        quality={name: bottom[name].astype(float) for name in ("correlation", "amplitude", "percent_good")},
+        quality={name: bottom[name].astype(float) for name in ("correlation", "amplitude")},
+        percent_good=np.where(tracked[:, None], bottom["percent_good"], 0).astype(float),
+        sound=variable["sound"].astype(float),
+        temperature=np.where(fixed["source"] & THERMOMETER, 0.01 * variable["temperature"], np.nan),
+        salinity=np.where(fixed["source"] & COMPUTED_SOUND, np.nan, variable["salinity"]),
+        head=_head(attitude),
         position=position,
         tracked=tracked,
     )
@@ -484,6 +493,13 @@ def _attitude(fixed: NDArray[np.void], system: NDArray[np.integer], rpy: Array) 
         beam_angle=np.deg2rad(angle),
         convex=fixed["system"] & 0x08 != 0,
     )
+
+
+def _head(attitude: Attitude) -> BeamHead | None:
+    """The beams of all ensembles, which look down."""
+    heads = np.unique(np.column_stack([attitude.beam_angle, attitude.convex, attitude.upward]), axis=0)
+    one = len(heads) == 1 and not heads[0, 2]
+    return BeamHead(round(float(np.rad2deg(heads[0, 0])), 3), bool(heads[0, 1])) if one else None
 
 
 def _velocities(bottom: NDArray[np.void], name: str) -> Array:

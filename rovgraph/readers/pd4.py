@@ -154,6 +154,11 @@ def decoded(frames: NDArray[np.uint8]) -> tuple[Pings, dict[str, int]]:
         range=np.where(records["range"] > 0, 0.01 * records["range"], np.nan),
         beams=np.full((len(records), 4), np.nan),
         quality={},
+        percent_good=np.zeros((len(records), 4)),
+        sound=np.where(of_five, records["sound_speed"], np.nan),
+        temperature=np.where(of_five, 0.01 * records["temperature"], np.nan),
+        salinity=np.full(len(records), np.nan),
+        head=None,
         position=np.full((len(records), 2), np.nan),
         tracked=np.full(len(records), True),
     ), refused

@@ -18,6 +18,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.disk_columns import every, spilled
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,29 @@ class Recording:
     def unix_offset(self, clock: str) -> float | None:
         """What the stamps of one of its clocks lack of Unix time [s]; None = not known."""
         return self.clocks[clock].unix_offset if clock in self.clocks else None
+
+
+def sound_of_dvl(time: Array, speed: Array, temperature: Array, source: str, clock: str) -> tuple[list[Channel], Any]:
+    """The speed of sound that a DVL worked with, where its file states it, and the temperature at its head.
+
+    Parameters
+    ----------
+    time, speed, temperature : ndarray, shape (n,) [s, m/s, deg C]; NaN = not known
+
+    Returns
+    -------
+    channels : of the stream "dvl_sound"; none where nothing was measured
+    settings : ``sound_speed_set_mps`` of the section ``dvl``: the speed, or "logged" where it changes
+    """
+    known = np.isfinite(time) & (speed > SLOWEST_MPS) & (speed < FASTEST_MPS)
+    if not known.any():
+        return [], {}
+    fixed = bool(np.ptp(speed[known]) == 0.0)
+    columns = {} if fixed else {"dvl_sound_speed": speed[known]}
+    if np.isfinite(warm := temperature[known]).any() and np.nanmax(warm) > np.nanmin(warm):
+        columns["water_temperature"] = warm
+    channel = Channel("dvl_sound", {"time": time[known], **columns}, f"{source}: {', '.join(columns)}", "", clock)
+    return [channel] if columns else [], {"sound_speed_set_mps": float(speed[known][0]) if fixed else "logged"}
 
 
 SOME = 10_000  # stamps that a rate is taken from

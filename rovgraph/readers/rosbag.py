@@ -26,8 +26,20 @@ from rovgraph.readers.ardupilot import ONE_POINT, depth, new_fixes, one_point, s
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording, Zero, in_files, preferred_first, too_slow
 from rovgraph.readers.rosbag_messages import CLOCK as NUCLEUS
-from rovgraph.readers.rosbag_messages import COLUMNS, DEFINITIONS, DOWN, GENERAL, LATER, READERS, Unusable, latency
+from rovgraph.readers.rosbag_messages import (
+    COLUMNS,
+    DEFINITIONS,
+    DOWN,
+    GENERAL,
+    LATER,
+    READERS,
+    Unusable,
+    beam_settings,
+    latency,
+)
 from rovgraph.readers.stamps import APART_S, by_arrivals
+from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
 BODIES = ("base_link", "base_link_frd", "base_footprint")
@@ -107,6 +119,8 @@ class Topic:
     latencies : messages whose stamp is of arrival, less the delay that they state
     clock : that its stamps share with other topics ("" = that of headers)
     declination_deg : that an instrument has added to its heading
+    beams : where the beams of a DVL point, as ``dvl.beams``
+    sound_speeds : that it worked with [m/s]
     """
 
     name: str
@@ -116,6 +130,8 @@ class Topic:
     latencies: int = 0
     clock: str = ""
     declination_deg: float = 0.0
+    beams: dict[str, Any] = field(default_factory=dict)
+    sound_speeds: set[float] = field(default_factory=set)
 
     def table(self, sensor: str) -> Array:
         """Rows of a sensor, shape (n, 2 + columns), not to be changed."""
@@ -292,6 +308,10 @@ class _Made:
             self.warnings.append(f"no DVL in the bag; its topics: {names}")
         else:
             self.settings["dvl"] = self._dvl_mounting(at[dvl], self._mountings[dvl])
+            if BEAMS in first and at[BEAMS] is at[dvl] and at[dvl].beams:
+                self.settings["dvl"]["beams"] = at[dvl].beams
+            if len(at[dvl].sound_speeds) == 1:
+                self.settings["dvl"]["sound_speed_set_mps"] = min(at[dvl].sound_speeds)
         if "ahrs" in first and (declination := at["ahrs"].declination_deg):
             self.settings.setdefault("environment", {})["declination_deg"] = round(declination, 3)
         if (mounting := self._mountings.get("depth")) is not None:
@@ -461,6 +481,9 @@ def _take(topic: Topic, message: Any, received: int) -> None:
     else:
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         topic.frame = topic.frame or message.header.frame_id
+        topic.beams = topic.beams or beam_settings(message)
+        if SLOWEST_MPS < (speed := getattr(message, "sound_speed", 0.0)) < FASTEST_MPS and len(topic.sound_speeds) < 2:
+            topic.sound_speeds.add(round(float(speed), 2))
     if topic.type in LATER and hasattr(message, "time_of_validity") and stamp:
         took = latency(message)
         stamp -= took

@@ -10,12 +10,15 @@ called ``interfaces``, so messages of others may have its types.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix
 from rovgraph.readers.nortek import LONGEST_DELAY_S
 from rovgraph.readers.nucleus import GAUSS
+from rovgraph.sensors.dvl_beam import BEAMS
 
 IMU = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
 QUATERNION = ("q_x", "q_y", "q_z", "q_w")
@@ -28,10 +31,13 @@ COLUMNS = {
     "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_valid", "dvl_sd"),
     "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
     "dvl_altitude": ("dvl_altitude",),
+    BEAMS: tuple(f"dvl_beam_{what}_{k}" for k in range(5) for what in ("valid", "velocity", "range", "sd")),
 }
 BOTTOM, WATER = 1, 2  # velocity modes
 INSTRUMENT = 1  # coordinate mode
 LONGEST_LATENCY_S = 5.0
+PHASED_ARRAY = 1  # type of a DVL
+UNIT_LENGTH, SPREAD, SAME_ANGLE_DEG = 0.02, 0.1, 0.5  # of vectors that are where beams point
 
 
 class RosReading(NamedTuple):
@@ -94,12 +100,62 @@ def _altitude(message: Any, valid: bool = True) -> Iterator[RosReading]:
         yield RosReading("dvl_altitude", (message.altitude,))
 
 
+def _beams(measured: Mapping[int, tuple[float, float, float]]) -> Iterator[RosReading]:
+    """Velocity, range and sd of beams by their numbers from 0 to 4; NaN = none."""
+    if any(math.isfinite(v) for values in measured.values() for v in values[:2]):
+        cells: list[float] = []
+        for k in range(5):
+            velocity, far, sd = measured.get(k, (math.nan,) * 3)
+            valid = float(math.isfinite(velocity) or math.isfinite(far)) if k in measured else math.nan
+            cells += [valid, velocity, far, sd]
+        yield RosReading(BEAMS, tuple(cells))
+
+
+def _marine_beams(message: Any) -> Iterator[RosReading]:
+    """Beams 1 to 4; velocities that are zero throughout were not filled in."""
+    moves = message.beam_velocities_valid and any(message.beam_velocity)
+    measured = {}
+    for k, velocity, far, variance in zip(
+        (1, 2, 3, 4), message.beam_velocity, message.range, message.beam_velocity_covar, strict=True
+    ):
+        measured[k] = (
+            float(velocity) if moves else math.nan,
+            float(far) if message.beam_ranges_valid and far > 0.0 else math.nan,
+            math.sqrt(variance) if moves and variance > 0.0 else math.nan,
+        )
+    yield from _beams(measured)
+
+
+def beam_settings(message: Any) -> dict[str, Any]:
+    """Where a ``marine_acoustic_msgs/Dvl`` says that its beams point, as ``dvl.beams``; {} = it does not."""
+    if getattr(message, "velocity_mode", WATER) != BOTTOM or not getattr(message, "beam_velocities_valid", False):
+        return {}
+    d = np.array([(v.x, v.y, v.z) for v in message.beam_unit_vec])
+    length = np.linalg.norm(d, axis=1)
+    around = np.column_stack([d[:, :2], np.ones(len(d))])
+    if (np.abs(length - 1.0) > UNIT_LENGTH).any() or np.linalg.svd(around, compute_uv=False)[-1] < SPREAD:
+        return {}
+    angle = np.rad2deg(np.arccos(np.clip(d[:, 2] / length, -1.0, 1.0)))
+    if np.ptp(angle) > SAME_ANGLE_DEG or angle.max() >= 90.0:
+        return {}
+    azimuth = np.rad2deg(np.arctan2(d[:, 1], d[:, 0])) % 360.0
+    stated = {"angle_deg": round(float(angle.mean()), 3), "azimuth_deg": [round(float(a), 2) for a in azimuth]}
+    return stated | ({"phased": True} if message.dvl_type == PHASED_ARRAY else {})
+
+
 def _dvl_msgs(message: Any) -> Iterator[RosReading]:
     """``dvl_msgs/DVL`` and its forebear of the A50's driver: fields of Water Linked's report."""
     sd = _sd(getattr(message, "covariance", ()), 3)
     sd = message.fom if math.isnan(sd) and message.fom > 0.0 else sd
     yield from _velocity(message.velocity, message.velocity_valid, sd)
     yield from _altitude(message, message.velocity_valid)
+    measured = {}
+    for beam in getattr(message, "beams", ()):
+        if 0 <= beam.id < 5 and beam.valid:
+            measured[beam.id] = beam.velocity, beam.distance if beam.distance > 0.0 else math.nan, math.nan
+        elif 0 <= beam.id < 5:
+            measured[beam.id] = (math.nan,) * 3
+    yield from _beams(measured)
 
 
 def _marine(message: Any) -> Iterator[RosReading]:
@@ -112,6 +168,8 @@ def _marine(message: Any) -> Iterator[RosReading]:
     yield from _velocity(v, valid, _sd(message.velocity_covar, 3), water)
     if not water:
         yield from _altitude(message, valid)
+        if hasattr(message, "beam_velocities_valid"):
+            yield from _marine_beams(message)
 
 
 def _simulated(message: Any) -> Iterator[RosReading]:

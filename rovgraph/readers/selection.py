@@ -23,6 +23,7 @@ from rovgraph.readers.recording import Channel, Clock, Left, Piece, Recording, i
 
 # along whose axes, or about whose place, another sensor's values are: both have to be of one instrument
 INSTRUMENT = {"mag": "imu", "ahrs": "imu", "dvl_heading": "dvl", "dvl_altitude": "dvl", "dvl_water": "dvl"}
+INSTRUMENT |= {"dvl_sound": "dvl", "dvl_beams": "dvl"}
 
 SHARED = 0.1  # of the shorter of two spans, that pieces may have in common
 UNIX = "Unix time"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
-from rovgraph.readers.recording import Channel, Clock, Left, Recording
+from rovgraph.readers.recording import Channel, Clock, Left, Recording, sound_of_dvl
 from rovgraph.sensors.dvl_beam import BEAMS
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)
@@ -81,9 +81,27 @@ def _of_beams(beams: Array, attitude: Attitude) -> Array:
     return np.column_stack([sign * across * (b1 - b2), sign * across * (b4 - b3), vertical, error])
 
 
+@dataclass(frozen=True)
+class BeamHead:
+    """Beams that look to port, starboard, forward and aft.
+
+    Attributes
+    ----------
+    angle_deg : against its axis [deg]
+    convex : they diverge
+    """
+
+    angle_deg: float
+    convex: bool
+
+
 CLOCK = "DVL's clock"
 FRAME = "forward (beam 3, or the ship's bow), starboard, down"
 NAMES = "dvl_vx", "dvl_vy", "dvl_vz"
+AZIMUTHS_DEG = [270.0, 90.0, 0.0, 180.0]  # of beams 1 to 4, from beam 3
+DEFAULT_PSU = 35.0  # salinity that nobody has set
+SOLUTIONS = "percent_three_beam", "percent_rejected", "percent_beams_bad", "percent_four_beam"
+WHOLE_PERCENT = 104.0  # of shares that are rounded each
 WATER = "dvl_water_vx", "dvl_water_vy", "dvl_water_vz"
 
 
@@ -102,9 +120,14 @@ class Pings:
     alignment : shape (n,), of beam 3 against the bow [rad]
     tilted : shape (n,), roll and pitch were used for ship or Earth axes
     depth : shape (n,) [m]
-    range : shape (n, 4), to the bottom along the vertical; NaN = none [m]
-    beams : shape (n, 4), velocity of the bottom towards each beam; NaN = not written [m/s]
+    range : shape (n, 4), to the bottom along the instrument's axis; NaN = none [m]
+    beams : shape (n, 4), velocity of the bottom towards each beam, so of the instrument along it; NaN = not written
+        [m/s]
     quality : name -> shape (n, 4), of the beams
+    percent_good : shape (n, 4), of the beams, or of kinds of solution (`_percent_good`)
+    sound, temperature, salinity : shape (n,), speed of sound that it worked with [m/s], water at its head [deg C] and
+        its salinity [psu], where it has no part in that speed; NaN = not known
+    head : its beams, where all pings have the same
     position : shape (n, 2), latitude and longitude; NaN = none [deg]
     tracked : shape (n,), it looked for the bottom
     """
@@ -122,6 +145,11 @@ class Pings:
     range: Array
     beams: Array
     quality: dict[str, Array]
+    percent_good: Array
+    sound: Array
+    temperature: Array
+    salinity: Array
+    head: BeamHead | None
     position: Array
     tracked: NDArray[np.bool_]
 
@@ -143,7 +171,8 @@ def recording(
     dated = np.isfinite(pings.time)
     if not dated.any():
         raise InputError(f"{path}: none of {len(dated)} ensembles has a valid time; set the instrument's clock")
-    channels = tuple(channels_of(pings))
+    water, sound = sound_of_dvl(pings.time, pings.sound, pings.temperature, "speed of sound", clock.name)
+    channels = (*channels_of(pings), *water)
     more = []
     if undated := int(np.count_nonzero(~dated)):
         more.append(Left("ensemble", undated, "no valid time"))
@@ -155,7 +184,7 @@ def recording(
         channels,
         {clock.name: clock},
         (*left, *more),
-        _settings(pings),
+        _settings(pings, sound, any("water_temperature" in channel.columns for channel in water)),
         tuple(_notes(pings)),
         (*warnings, *_warnings(pings, channels)),
         _tables(pings, dated),
@@ -203,11 +232,19 @@ def _measured(values: Array, constants: bool = False) -> bool:
     return bool(np.ptp(values) > 0.0) or (constants and bool(np.isfinite(values).any()))
 
 
-def _settings(pings: Pings) -> dict[str, Any]:
+def _settings(pings: Pings, sound: dict[str, Any], measured: bool) -> dict[str, Any]:
     out: dict[str, Any] = {}
+    if sound:
+        out["dvl"] = sound
+    if pings.head is not None and np.isfinite(pings.beams).any():
+        stated = {"angle_deg": pings.head.angle_deg, "azimuth_deg": AZIMUTHS_DEG}
+        out["dvl"] = out.get("dvl", {}) | {"beams": stated | ({} if pings.head.convex else {"convex": False})}
+    salinity = np.unique(pings.salinity)
+    if len(salinity) == 1 and np.isfinite(salinity[0]) and salinity[0] != DEFAULT_PSU and measured:
+        out["sound"] = {"salinity_psu": float(salinity[0])}
     alignment, bias = np.unique(pings.alignment), np.unique(pings.bias)
     if len(alignment) == 1 and alignment[0] and np.all(pings.system < SHIP):
-        out["dvl"] = {"mount_rpy_deg": [0.0, 0.0, round(float(np.rad2deg(alignment[0])), 2)]}
+        out["dvl"] = out.get("dvl", {}) | {"mount_rpy_deg": [0.0, 0.0, round(float(np.rad2deg(alignment[0])), 2)]}
     if len(bias) == 1 and bias[0]:
         out["environment"] = {"declination_deg": round(float(np.rad2deg(bias[0])), 2)}
     located = np.flatnonzero(np.isfinite(pings.position[:, 0]))
@@ -244,14 +281,23 @@ def _warnings(pings: Pings, channels: tuple[Channel, ...]) -> Iterator[str]:
         yield "beam 3 is not at the bow (EA): compare the heading and the mounting of the DVL with `rovgraph check`"
 
 
+def _percent_good(pings: Pings) -> tuple[str, ...]:
+    """What the four percentages are of: beams, or kinds of solution, which sum up to 100."""
+    shares = pings.percent_good.sum(axis=1)
+    if not shares.any():
+        return ()
+    return SOLUTIONS if shares.max() <= WHOLE_PERCENT else tuple(f"percent_good_{k + 1}" for k in range(4))
+
+
 def _tables(pings: Pings, dated: NDArray[np.bool_]) -> dict[str, dict[str, Array]]:
     rows = dated & pings.tracked
     out: dict[str, dict[str, Array]] = {}
     if rows.any():
-        by_beam = {"range": pings.range, "velocity": pings.beams, **pings.quality}
+        by_beam = {"distance": pings.range, "velocity": pings.beams, **pings.quality}
         if not np.isfinite(pings.beams).any():
             del by_beam["velocity"]
         columns = {f"{name}_{k + 1}": values[rows, k] for name, values in by_beam.items() for k in range(4)}
+        columns |= dict(zip(_percent_good(pings), pings.percent_good[rows].T, strict=False))
         out[BEAMS] = {"time": pings.time[rows], **columns, "error_velocity": pings.error[rows]}
     located = dated & np.isfinite(pings.position[:, 0])
     if located.any():

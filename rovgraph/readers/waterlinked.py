@@ -30,6 +30,7 @@ from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS
 VELOCITIES = ("velocity", "velocity_water")
 FORMATS = ("json_v1", "json_v2", "json_v3")  # minor versions, as json_v3.2, only add to them
 STAMPED = "json_v3"  # the first with a time of validity
+UNTYPED = "json_v1"  # whose reports state no type, and are velocities
 _OTHERS = ("position_local", "response")
 
 
@@ -58,7 +59,12 @@ class VelocityReport:
 
 def is_report(row: dict[str, Any]) -> bool:
     """Whether a JSON object is one of this protocol."""
-    return row.get("type") in (*VELOCITIES, *_OTHERS) and "format" in row
+    return _type(row) in (*VELOCITIES, *_OTHERS) and "format" in row
+
+
+def _type(row: dict[str, Any]) -> object:
+    untyped = "type" not in row and "velocity_valid" in row and str(row.get("format")).startswith(UNTYPED)
+    return "velocity" if untyped else row.get("type")
 
 
 def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
@@ -68,7 +74,7 @@ def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
     ------
     Refused : it is to be skipped
     """
-    if row.get("type") in _OTHERS:
+    if _type(row) in _OTHERS:
         return None
     _check(row)
     water = row.get("type") == "velocity_water" or row.get("tracking_mode") == "water"
@@ -89,7 +95,7 @@ def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
 
 
 def _check(row: dict[str, Any]) -> None:
-    if row.get("type") not in VELOCITIES:
+    if _type(row) not in VELOCITIES:
         raise Refused("unknown report", f"a report of type {shown(str(row.get('type')))} is ignored")
     if not str(row.get("format")).startswith(FORMATS):
         text = f"format {shown(str(row.get('format')))}, expected {STAMPED}"
@@ -139,7 +145,7 @@ _NUMBERS = (
 )
 _BEAM = {  # of a transducer -> quantity of a beam
     "velocity": "velocity",
-    "distance": "distance",
+    "distance": "range",  # along the beam: their mean is the altitude over the cosine of 22.5 deg
     "rssi": "rssi",
     "nsd": "nsd",
     "beam_valid": "valid",
@@ -224,10 +230,11 @@ class _Reports:
         self._rows = array("d")  # of `_ROW`
         self._beams = array("d")  # row, id, `_BEAM`
         self._position = array("d")  # `_POSITION`
+        self._speeds: set[float] = set()  # of sound, that it was set to [m/s]
         self._faults = self._taken = 0
 
     def take(self, row: dict[str, Any]) -> None:
-        kind = row.get("type")
+        kind = _type(row)
         try:
             if kind == "response":
                 self._response(row)
@@ -264,6 +271,8 @@ class _Reports:
             note = f"the DVL's settings: {', '.join(said)}"
             if said and note not in self.notes:
                 self.notes.append(note)
+            if (speed := _number(result.get("speed_of_sound"))) > 0.0:
+                self._speeds.add(speed)
 
     def recording(self, path: Path, format_: str) -> Recording:
         """All that was taken.
@@ -286,7 +295,10 @@ class _Reports:
         channels = tuple(self._channels(table, time, clock.name, arrived))
         left = tuple(Left(name, count, why) for (name, why), count in sorted(self.left.items()) if count)
         notes, warnings = tuple(self.notes), tuple(self.warnings)
-        return Recording(str(path), format_, channels, clocks, left, {}, notes, warnings, self._tables(keep, time))
+        settings = {"dvl": {"sound_speed_set_mps": min(self._speeds)}} if len(self._speeds) == 1 else {}
+        return Recording(
+            str(path), format_, channels, clocks, left, settings, notes, warnings, self._tables(keep, time)
+        )
 
     def _times(self, path: Path, table: Array) -> tuple[Array, Array, Clock]:
         """Which reports can be used, when they were valid [s], and by which clock."""

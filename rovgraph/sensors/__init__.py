@@ -10,6 +10,7 @@ from rovgraph.sensors.acoustic import RANGE, SHIP, SHIP_HEADING, SHIP_TILT, USBL
 from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, VEHICLE_TILT, CompassHeading, Tilt
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
 from rovgraph.sensors.dvl_beam import DVL_BEAMS, SINGLE_BEAMS, DvlBeam
+from rovgraph.sensors.dvl_sound import DVL_SOUND
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
 from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
 from rovgraph.sensors.position import DEPTH, FIX, SEEN_PLACE, PlaceOffset, Position
@@ -81,7 +82,7 @@ IMU = Sensor(  # it carries the estimate from one measurement to the next
 )
 
 _VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
-_DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DVL_BEAMS, *SINGLE_BEAMS
+_DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DVL_SOUND, DVL_BEAMS, *SINGLE_BEAMS
 _ACOUSTIC = USBL, RANGE, SHIP, SHIP_HEADING, SHIP_TILT
 for _sensor in (IMU, MAG, AHRS, *_VEHICLE, *_DVL, DEPTH, FIX, SEEN_PLACE, *_ACOUSTIC, THRUSTER):
     SENSORS[_sensor.name] = _sensor

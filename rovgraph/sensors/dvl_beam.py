@@ -27,7 +27,8 @@ from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instru
 BEAMS = "dvl_beams"  # stream of pings, and name of the table beside a log
 NUMBERS = range(len(BEAM_SENSORS))  # of beams
 QUANTITIES = "valid", "velocity", "range", "distance", "sd"  # of each beam, in the order of the stream's columns
-ROUND_TRIP_C0 = 1536.0  # sound speed for which the elements of a phased array are spaced [m/s]
+PHASED_C0 = 1536.0  # speed of sound for which a phased array is spaced, with beams of 30 deg [m/s]
+USUAL_C = 1500.0  # of a phased array where none is stated [m/s]
 ERROR_GATE = 3.0  # sds of the error velocity, up to which four beams that the instrument refused are taken
 RATE_SHARE = 2.0**0.5  # beams of a ping share the noise of the rate, each row has it by itself
 
@@ -53,6 +54,8 @@ def beam_geometry(dvl: Dvl) -> BeamGeometry | None:
     if beams.angle_deg is None or not beams.azimuth_deg:
         return None
     angle = np.deg2rad(beams.angle_deg)
+    if beams.phased:
+        angle = np.arcsin(min(np.sin(angle) * beam_sound_speed(dvl) / PHASED_C0, 1.0 - 1e-9))
     azimuth = np.deg2rad(np.array(beams.azimuth_deg) + (0.0 if beams.convex else 180.0))
     around = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
     down = np.ones((len(azimuth), 1))
@@ -60,6 +63,11 @@ def beam_geometry(dvl: Dvl) -> BeamGeometry | None:
     tilts = np.hstack([np.cos(angle) * around, -np.sin(angle) * down])
     numbers = tuple(range(beams.first_number, beams.first_number + len(azimuth)))
     return BeamGeometry(numbers, directions, tilts)
+
+
+def beam_sound_speed(dvl: Dvl) -> float:
+    """Speed of sound that the directions of a phased array's beams, and velocities along them, are given for [m/s]."""
+    return dvl.sound_speed_mps or USUAL_C
 
 
 def beam_sd(dvl: Dvl) -> float:

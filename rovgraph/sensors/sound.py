@@ -12,13 +12,53 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
+from numpy.typing import ArrayLike
 
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.geometry import Array
 
 SLOWEST_MPS, FASTEST_MPS = 1300.0, 1700.0
+BAR_OF_M = 0.10198  # of water [bar/m]
 LAYER_M = 1.0  # of water that is taken as one
 BEYOND_M = 1.0  # the end of a profile, that a vehicle may go
+
+
+# of `sound_speed`: by the power of the pressure [bar], then of the temperature [deg C]
+_WATER = (
+    (1402.388, 5.03711, -5.80852e-2, 3.3420e-4, -1.478e-6, 3.1464e-9),
+    (0.153563, 6.8982e-4, -8.1788e-6, 1.3621e-7, -6.1185e-10),
+    (3.1260e-5, -1.7107e-6, 2.5974e-8, -2.5335e-10, 1.0405e-12),
+    (-9.7729e-9, 3.8504e-10, -2.3643e-12),
+)
+_SALT = (
+    (1.389, -1.262e-2, 7.164e-5, 2.006e-6, -3.21e-8),
+    (9.4742e-5, -1.2580e-5, -6.4885e-8, 1.0507e-8, -2.0122e-10),
+    (-3.9064e-7, 9.1041e-9, -1.6002e-10, 7.988e-12),
+    (1.100e-10, 6.649e-12, -3.389e-13),
+)
+_SALT_15 = (-1.922e-2, -4.42e-5), (7.3637e-5, 1.7945e-7)
+_SALT_2 = (1.727e-3,), (-7.9836e-6,)
+
+
+def sound_speed(salinity: ArrayLike, temperature: ArrayLike, depth: ArrayLike) -> Array:
+    """Speed of sound in water [m/s], shape of the arguments together.
+
+    Chen and Millero 1977, as in Fofonoff and Millard, UNESCO Technical Papers in Marine Science 44, 1983, p. 46; for 0
+    to 40 psu, 0 to 40 deg C.
+
+    Parameters
+    ----------
+    salinity : [psu]
+    temperature : [deg C]
+    depth : [m]
+    """
+    s, t, p = (np.asarray(a, dtype=float) for a in (salinity, temperature, depth))
+    p = BAR_OF_M * p
+    water, salt, salt_15, salt_2 = (
+        sum(polyval(t, row) * p**k for k, row in enumerate(rows)) for rows in (_WATER, _SALT, _SALT_15, _SALT_2)
+    )
+    return np.asarray(water + s * salt + s**1.5 * salt_15 + s**2 * salt_2)
 
 
 class SoundSpeedProfile:
@@ -129,10 +169,4 @@ def _read(path: Path) -> SoundSpeedProfile:
     depth = table["depth"].to_numpy(float)
     if "sound_speed" in table:
         return SoundSpeedProfile(depth, table["sound_speed"].to_numpy(float))
-    try:
-        import gsw
-    except ImportError:
-        raise InputError(f"{path}: temperature and salinity need gsw; pip install rovgraph[acoustics]") from None
-    pressure = 1.0198 * depth  # [dbar]
-    speed = gsw.sound_speed_t_exact(table["salinity"].to_numpy(float), table["temperature"].to_numpy(float), pressure)
-    return SoundSpeedProfile(depth, np.asarray(speed))
+    return SoundSpeedProfile(depth, sound_speed(table["salinity"].to_numpy(), table["temperature"].to_numpy(), depth))

@@ -46,7 +46,7 @@ SURE = 3.0  # standard deviations
 SMALL_S = 0.05  # difference of gap and jump up to which no samples are missing [s]
 CLOCKED = {  # by one clock
     "imu": ("imu", "mag", "ahrs"),
-    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", BEAMS),
+    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", "dvl_sound", BEAMS),
 }
 NAMES = {"imu": "IMU", "dvl": "DVL"}
 

@@ -29,8 +29,12 @@ UNITS: dict[str, dict[str, float]] = {
     "calibration.acc_scale.sd": {"%": 1e-2, "ppm": 1e-6},
     "dvl.velocity_sd_mps": {"cm/s": 1e-2, "mm/s": 1e-3},
     "calibration.dvl_scale.sd": {"%": 1e-2},
+    "dvl.beams.angle_deg": {"deg": 1.0},
+    "dvl.beams.azimuth_deg": {"deg": 1.0},
 }
 TRIPLES = ("dvl.velocity_sd_mps",)  # a data sheet has one number for all axes
+LISTS = ("dvl.beams.azimuth_deg",)  # and of these some
+WITHOUT_UNIT = ("dvl.beams.first_number", "dvl.beams.phased")
 KINDS = ("imu", "dvl")
 
 
@@ -41,14 +45,14 @@ class Fact:
     Attributes
     ----------
     key : of the configuration, dotted
-    stated : number and unit as the data sheet has them
-    value : in the unit of the key; three equal numbers where the key has three
+    stated : number and unit as the data sheet has them, or what has no unit
+    value : in the unit of the key; three equal numbers where the key has three, some where it has a list
     source : the document
     """
 
     key: str
     stated: str
-    value: float | tuple[float, float, float]
+    value: float | bool | tuple[float, ...]
     source: str
 
 
@@ -94,10 +98,12 @@ def _own(entry: Mapping[str, Any], base: Mapping[str, Any]) -> tuple[str, ...]:
     return () if entry is base else tuple(entry["notes"])
 
 
-def _fact(key: str, stated: str, source: str) -> Fact:
-    number, unit = stated.split()
-    value = float(f"{float(number) * UNITS[key][unit]:.4g}")
-    return Fact(key, stated, (value, value, value) if key in TRIPLES else value, source)
+def _fact(key: str, stated: str | int | bool, source: str) -> Fact:
+    if key in WITHOUT_UNIT:
+        return Fact(key, str(stated).lower(), stated, source)  # type: ignore[arg-type]
+    *numbers, unit = str(stated).split()
+    values = tuple(float(f"{float(number) * UNITS[key][unit]:.4g}") for number in numbers)
+    return Fact(key, str(stated), values if key in LISTS else 3 * values if key in TRIPLES else values[0], source)
 
 
 def known_preset(kind: str, name: str) -> str:
