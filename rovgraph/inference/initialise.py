@@ -479,6 +479,10 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
             + "".join(f"; {sensor} is left out: {why}" for sensor, why in unusable.items())
         )
     assumptions += [f"{sensor} is left out: {why}" for sensor, why in unusable.items() if sensor in log]
+    if beams:
+        assumptions.append(
+            f"pings of the DVL are taken by their beams, {len(beams) - 1} at {config.dvl.beams.angle_deg:g} deg"
+        )
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams}

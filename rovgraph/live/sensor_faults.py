@@ -43,6 +43,7 @@ from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_
 from rovgraph.log.streams import joined
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import HEADING_STREAMS, heading_sources
 
 SILENT_AT_FIRST_S = 10.0  # after a first measurement, as long as the period is not known
@@ -148,13 +149,23 @@ class Faults:
     _now: float = -np.inf
     _around: dict[str, deque[Measurement]] = field(default_factory=lambda: {"imu": deque(), "dvl": deque()})
     _turns: deque[tuple[float, Array]] = field(default_factory=lambda: deque(maxlen=TURNS))  # time, rates
+    _invalid_ping: float = -np.inf  # time of the newest one [s]
 
     def __post_init__(self) -> None:
         self._companies: Mapping[str, Company] = companies(self.config)
         self._yaw_axis = mount_matrix(self.config.imu.mount_rpy_deg)[2]
 
     def look(self, m: Measurement) -> Screening:
-        """Whether a measurement is one."""
+        """Whether a measurement is one; the beams of an invalid ping are none."""
+        if m.sensor == BEAMS and m.time == self._invalid_ping:
+            return Screening(False, count=0)
+        verdict = self._look(m)
+        if m.sensor == "dvl" and not verdict.use:
+            self._invalid_ping = m.time
+        return verdict
+
+    def _look(self, m: Measurement) -> Screening:
+        """Whether a measurement is one, by itself."""
         watch = self.watches.get(m.sensor)
         if watch is None or watch.by_hand:
             watch = self.watches[m.sensor] = Watch()
@@ -510,7 +521,7 @@ class Incoherence:
 
     def keeps_out(self, sensor: str, time: float) -> bool:
         """Whether a measurement is left out."""
-        return sensor == SENSOR and self._begin < time < self._end
+        return sensor in (SENSOR, BEAMS) and self._begin < time < self._end
 
     def passed(self, snapshot: FilterSnapshot) -> None:
         """Remember a keyframe that the lag has passed, for as long as the filter may go back to it."""

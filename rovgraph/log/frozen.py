@@ -24,6 +24,7 @@ from rovgraph.log.log import Log
 from rovgraph.log.streams import Stream, integral, labels
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.sensors.dvl_beam import BEAMS
 
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ROUNDING = 1e-9  # relative, of numbers that are converted
@@ -287,8 +288,9 @@ def without(stream: Stream, found: Iterable[FrozenStretch]) -> Stream:
 
 
 def are_in(stream: Stream, found: Iterable[FrozenStretch]) -> NDArray[np.bool_]:
-    """Which measurements of a stream are invalid, shape (n,)."""
-    times = [stretch.time for stretch in found if stretch.sensor == stream.sensor]
+    """Which measurements of a stream are invalid, shape (n,); the beams of an invalid ping are."""
+    sensor = "dvl" if stream.sensor == BEAMS else stream.sensor
+    times = [stretch.time for stretch in found if stretch.sensor == sensor]
     return np.isin(stream.time, np.concatenate(times)) if times else np.zeros(len(stream), bool)
 
 

@@ -329,16 +329,11 @@ def _select(
     data = np.column_stack([cells.get(c, np.full(len(line), np.nan)) for c in columns])
     filled = ~np.isnan(data[:, [columns.index(c) for c in required]])
     complete, partly = filled.all(axis=1), filled.any(axis=1)
-    for k, name in enumerate(columns):
-        if sensor in SENSORS and SENSORS[sensor].columns[k].flag:
-            _require_flags(name, data[:, k], line, source)
+    _mend_columns(SENSORS[sensor].columns if sensor in SENSORS else (), data, line, source)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly)
     if sensor in SENSORS and (several := SENSORS[sensor].complete) is not None:
         complete, partly = several(data), ~np.isnan(data).all(axis=1)
-    for column in SENSORS[sensor].columns if sensor in SENSORS else ():
-        if column.is_sd:
-            _known_sd(column, data[:, columns.index(column.name)], line, source)
     if sensor == "place":
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
@@ -350,11 +345,21 @@ def _select(
     return data, complete
 
 
-def _require_flags(name: str, flags: Array, line: Lines, source: str) -> None:
-    """Check that a column holds nothing but 0 and 1."""
-    odd = np.flatnonzero(~np.isnan(flags) & (flags != 0.0) & (flags != 1.0))
-    if odd.size:
-        raise InputError(f"{source}: line {line[odd[0]]}, column {name}: {flags[odd[0]]:g}, expected 0 or 1")
+def _mend_columns(columns: Sequence[Column], data: Array, line: Lines, source: str) -> None:
+    """Sds that are none become NaN.
+
+    Raises
+    ------
+    InputError : a flag that is neither 0 nor 1
+    """
+    for column, values in zip(columns, data.T, strict=False):
+        odd = np.flatnonzero(~np.isnan(values) & (values != 0.0) & (values != 1.0)) if column.flag else ()
+        if len(odd):
+            raise InputError(
+                f"{source}: line {line[odd[0]]}, column {column.name}: {values[odd[0]]:g}, expected 0 or 1"
+            )
+        if column.is_sd:
+            _known_sd(column, values, line, source)
 
 
 def _pings(data: Array, complete: Bools, partly: Bools) -> tuple[Bools, Bools]:

@@ -162,8 +162,7 @@ class Assembly:
         admissible, by_beams = self._beams.of_log(log.streams)
         for sensor, stream in streams.items():
             mask = admitted(sensor, stream.data, self.config, self._left_out)
-            if sensor == "dvl" and by_beams.any():
-                self._left_out[sensor, BY_BEAMS] += int(by_beams.sum())
+            if sensor == "dvl":
                 mask &= ~by_beams
             stream = stream if mask.all() else stream.take(mask)
             if sensor in self._acoustics.instruments:
@@ -206,7 +205,6 @@ class Assembly:
         if m.sensor == "dvl":
             self._beams.velocities = True
             if np.isin(here[:, at.SENSOR], [self._which[sensor] for sensor in self._beams.instruments]).any():
-                self._left_out["dvl", BY_BEAMS] += 1
                 return InsertResult.IN
             return self._insert(m)
         velocity = first + np.flatnonzero(here[:, at.SENSOR] == self._which.get("dvl", -1))
@@ -551,9 +549,10 @@ class Assembly:
 
     @property
     def left_out(self) -> Counter[tuple[str, str]]:
-        """(sensor, reason) -> count of measurements that never reach the graph."""
+        """(sensor, reason) -> count of measurements that never reach the graph; pings by beams do."""
         pieces = Counter(("thruster", why) for _, why in self._no_pieces)
-        return self._left_out + self._counted(np.ones(len(self._events), bool)) + pieces
+        every = self._left_out + self._counted(np.ones(len(self._events), bool)) + pieces
+        return Counter({(sensor, why): count for (sensor, why), count in every.items() if why != BY_BEAMS})
 
     def _counted(self, some: NDArray[np.bool_]) -> Counter[tuple[str, str]]:
         """Of some of the events, those that are left out."""

@@ -240,7 +240,6 @@ def _beam_stream_columns(number: int) -> tuple[Column, ...]:
 DVL_BEAMS = Sensor(
     BEAMS,
     tuple(column for number in NUMBERS for column in _beam_stream_columns(number)),
-    may_begin_later=True,
     complete=_has_any,
 )
 SINGLE_BEAMS = tuple(
