@@ -1,4 +1,4 @@
-"""A DVL's beams against truth: beams lost, biased, refused, off by their angle, over a bottom, by an independent simulator.
+"""A DVL's beams against truth, by an independent simulator: lost, biased, refused, off by their angle, over a bottom.
 
     python benchmarks/beams.py                                     every row, 20 seeds, and what a ping costs
     python benchmarks/beams.py --rows healthy --seeds 3 --online

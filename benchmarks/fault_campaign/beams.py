@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fault_campaign.earth import Array
-from fault_campaign.motion import Motion, mounting
+from fault_campaign.motion import Motion
 from fault_campaign.vehicle import Triple, Vehicle
 
 Flags = NDArray[np.bool_]
