@@ -143,6 +143,13 @@ _ROWS = (
     Rule("taken out", "seconds in which a sensor was ignored, since it contradicts all others", 0.0, live="of the DVL"),
     Rule("close", "likelihood of the next best choice of what to ignore", 1e-4),
     Rule("rejected", "largest share of measurements rejected in a minute", 0.05, 0.5, live="last minute", looks=3),
+    Rule(
+        "one beam",
+        "largest share of one beam's measurements rejected in a minute, beside beams that agree",
+        0.05,
+        live="last minute",
+        looks=3,
+    ),
     Rule("too large", "mean square of normalised residuals, in the dive", 2.0, 6.0, live="last minute", looks=3),
     Rule(
         "too small",

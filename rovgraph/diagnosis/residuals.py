@@ -5,7 +5,7 @@ their covariance is I - H P H' in units of the noise. So the limits upwards are 
 only the filter's normalised innovations squared (NIS) can tell, whose expectation is the measurement's dimension.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -18,6 +18,7 @@ from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span,
 from rovgraph.distributions import binomial_tail, chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.rules import CHANCE, RULES, USUAL_SHARE, Severity
 from rovgraph.sensors.instruments import HEADING_STREAMS
@@ -31,6 +32,7 @@ LASTING_S = (5.0, 20.0)  # over which errors last, unlike noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {
     "dvl": "dvl.velocity_sd_mps",
+    **dict.fromkeys(BEAM_SENSORS, "dvl.beam_sd_mps"),
     "dvl_water": "dvl.water_velocity_sd_mps",
     "mag": "heading.mag_sd_deg",
     "dvl_heading": "heading.dvl_sd_deg",
@@ -66,7 +68,20 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
         bad = np.flatnonzero(share > RULES["rejected"].doubtful)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
         begin_s, end_s = evidence.start + begin * MINUTE, min(evidence.start + (end + 1) * MINUTE, evidence.end)
-        yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start)
+        inside = {n: o.weight[(o.time >= begin_s) & (o.time <= end_s)] for n, o in evidence.residuals.items()}
+        alone = is_one_beam(r.sensor, {n: float(np.mean(w <= 0.0)) for n, w in inside.items() if len(w)})
+        yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start, alone)
+
+
+def is_one_beam(sensor: str, rejected: Mapping[str, float]) -> bool:
+    """Whether a sensor is a beam of a DVL two or more of whose others agree with the estimate.
+
+    Parameters
+    ----------
+    rejected : sensor -> share of its measurements that were rejected at the time
+    """
+    others = [share for name, share in rejected.items() if name in BEAM_SENSORS and name != sensor]
+    return sensor in BEAM_SENSORS and sum(share < RULES["rejected"].doubtful for share in others) > 1
 
 
 def _gives_up(out: NDArray[np.bool_]) -> bool:
@@ -88,8 +103,22 @@ def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
     return np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
 
 
-def rejected_in(sensor: str, begin: float, end: float, share: float, start: float) -> Statistic:
-    """A share of rejected measurements in a minute; ``start`` is when the dive began [s]."""
+def rejected_in(sensor: str, begin: float, end: float, share: float, start: float, one_beam: bool = False) -> Statistic:
+    """A share of rejected measurements in a minute; ``start`` is when the dive began [s].
+
+    ``one_beam`` : the sensor is one beam of a DVL, and its others agree.
+    """
+    if one_beam:
+        return Statistic(
+            "one beam",
+            sensor,
+            begin,
+            end,
+            share,
+            f"up to {share:.0%} of this beam's measurements contradict the DVL's other beams and were rejected, "
+            f"{span(begin, end, start)}",
+            "the other beams carry the track; look for fouling or a damaged transducer",
+        )
     return Statistic(
         "rejected",
         sensor,
@@ -328,8 +357,8 @@ def _remedy_of_lasting(sensor: str) -> str:
 
 MEASURE_THE_SAME = (
     ("heading", HEADING_STREAMS),
-    ("vertical motion", ("dvl", "depth")),
-    ("horizontal motion", ("dvl", "fix", "place", "dvl_water", "thruster")),
+    ("vertical motion", ("dvl", *BEAM_SENSORS, "depth")),
+    ("horizontal motion", ("dvl", *BEAM_SENSORS, "fix", "place", "dvl_water", "thruster")),
 )
 OF_RESIDUALS = ("rejected", "too large", "lasting")
 

@@ -7,8 +7,8 @@
 
 Gates. A sensor that was left out for longer than `DISTRUSTED_S` returns only within `RETURN_SD` of the prediction,
 whose uncertainty grows without it. After more than its `READMIT` the sensor is taken to measure a motion that no model
-has, and the covariance of what it observes is inflated: of velocity along the axes, n's or the body's, along which it
-is known better.
+has, but for one beam of a DVL whose others agree. The covariance of what it observes is inflated: of velocity along the
+axes, n's or the body's, along which it is known better.
 
 Update. Innovations r and Jacobians H are whitened, so their noise is I. With S = H P H' and W the weights of the
 losses,
@@ -56,6 +56,7 @@ from rovgraph.kernels.measurement_row import (
     TIME,
     MeasuredRows,
 )
+from rovgraph.kernels.measurements import DVL_BEAM
 from rovgraph.kernels.states import epoch_in
 from rovgraph.kernels.weighting import loss_weight
 
@@ -564,6 +565,18 @@ class Corrected(NamedTuple):
 
 
 @helper
+def _one_beam_disagrees(measured: MeasuredRows, sensors: Array, found: Innovations) -> bool:
+    """Whether one beam of a DVL lies beyond its gate and two or more within: it is the beam, and not the motion."""
+    out, fit = 0, 0
+    for j in range(len(measured.which)):
+        sensor = sensors[measured.which[j]]
+        if sensor[KIND] == DVL_BEAM:
+            within = normalised_squared(found.S, found.r, found.first[j], found.first[j + 1]) <= sensor[GATE] ** 2
+            out, fit = out + (not within), fit + within
+    return out == 1 and fit > 1
+
+
+@helper
 def correct(
     known: FilterState,
     measured: MeasuredRows,
@@ -605,7 +618,7 @@ def correct(
                 taken += 1
     linearize_keyframe(known, measured, model, scratch, found)
     innovation_covariance(P, found)
-    entered = False
+    entered, alone = False, _one_beam_disagrees(measured, sensors, found)
     for j in range(m):
         sensor = sensors[which[j]]
         nis_out[j] = normalised_squared(S, r, first[j], first[j + 1])
@@ -613,7 +626,7 @@ def correct(
         if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
             weight_out[j] = 0.0
             elapsed = rows[j, TIME] - since[which[j]]
-            if elapsed > sensor[READMIT]:
+            if elapsed > sensor[READMIT] and not (alone and sensor[KIND] == DVL_BEAM):
                 directions, spread = observed_directions(x, sensor, n, elapsed)
                 inflate(P, found, j, directions, spread)
                 innovation_covariance(P, found)

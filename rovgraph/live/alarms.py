@@ -19,6 +19,7 @@ from rovgraph.diagnosis.residuals import (
     ENOUGH,
     correlated_residuals_in,
     frozen_for,
+    is_one_beam,
     rejected_in,
     share_rejected,
     too_large_in,
@@ -171,12 +172,14 @@ class LiveAlarms:
         self, known: Gaussian, engine: FilterEngine, watches: Mapping[str, Watch], time: float
     ) -> Iterator[Statistic]:
         begin = max(self._start, time - MINUTE)
-        for sensor in dict.fromkeys(name for counts in self._counts for name in counts):
-            of = [counts[sensor] for counts in self._counts if sensor in counts]
+        sensors = dict.fromkeys(name for counts in self._counts for name in counts)
+        met = {name: [counts[name] for counts in self._counts if name in counts] for name in sensors}
+        out = {n: sum(c.rejected for c in of) / max(sum(c.used + c.rejected for c in of), 1) for n, of in met.items()}
+        for sensor, of in met.items():
             used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
             if rejected:
                 share = share_rejected(np.array([float(rejected)]), np.array([float(used + rejected)]))[0]
-                yield rejected_in(sensor, begin, time, float(share), self._start)
+                yield rejected_in(sensor, begin, time, float(share), self._start, is_one_beam(sensor, out))
             if used >= ENOUGH:
                 dim = engine.initial.instruments[sensor].model.dim
                 square, share = sum(c.nis for c in of) / (used * dim), float(np.mean([c.share for c in of]))
