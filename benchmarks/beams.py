@@ -2,6 +2,7 @@
 
     python benchmarks/beams.py                                     every row, 20 seeds, and what a ping costs
     python benchmarks/beams.py --rows healthy --seeds 3 --online
+    python benchmarks/beams.py --figure docs/images/beams.png      what losing two beams costs
 
 prints a table in Markdown: what each row is about, with its target, and the horizontal rms error and NEES of the
 smoothed, filtered and online estimates. Dives go through the command line. A row compares dives of the same motion and
@@ -21,7 +22,7 @@ import pandas as pd
 from fault_campaign.beams import Beams, Bottom, Fault, Head, bias, lose, refuse, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, run_command, run_dive, write_dive
 from fault_campaign.motion import Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
@@ -205,6 +206,7 @@ def by_velocity(*faults: Fault, **more: Any) -> Setting:
 
 
 ALL = (0, 1, 2, 3)
+LOSS = "two adjacent beams lost for half of 20 min"
 HALF = 300.0, 900.0  # of 20 min
 WIDE = Beams(Head(width=4.6), Bottom(2.0 + 22.5, 17.5, 302.0, 0.6), (), (0.0, 0.0, 0.14, 0.0))
 CALIBRATED = {
@@ -217,7 +219,7 @@ CALIBRATED = {
 SOUND = 1500.0 / 1470.0 - 1.0  # 1500 m/s set, at 5 degrees and a salinity of 31
 ROWS = {
     "healthy": Row("error and sd within 3 %", {"by beams": by_beams(), "by velocity": by_velocity()}, healthy),
-    "two adjacent beams lost for half of 20 min": Row(
+    LOSS: Row(
         "end error at most 1.3 times that with all",
         {
             "lost": by_beams(lose((0, 1), *HALF), seconds=1200.0),
@@ -300,6 +302,31 @@ def cost(rounds: int) -> tuple[float, float]:
     return least["auto"] / pings, least["velocity"] / pings
 
 
+def draw(path: Path) -> None:
+    """Horizontal error and sd of the filter in the first dive of the row in which two beams are lost."""
+    import tempfile
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.axvspan(*HALF, color="0.93", label="two beams lost")
+    for name, colour in (("by velocity", "tab:red"), ("lost", "tab:blue"), ("with all", "0.3")):
+        dive = make_dive(ROWS[LOSS].dives[name], 0)
+        with tempfile.TemporaryDirectory() as folder:
+            write_dive(dive, Path(folder))
+            files = [f"{folder}/{part}" for part in ("log.csv", "vehicle.yaml", "out")]
+            run_command(["smooth", files[0], "--config", files[1], "--out", files[2], "--no-figures"])
+            track = pd.read_csv(f"{files[2]}/trajectory_filtered.csv").iloc[::10]
+        off = track[["north", "east"]].to_numpy() - dive.motion.local(track["time"].to_numpy())[:, :2]
+        label = {"by velocity": "velocities only", "lost": "beams", "with all": "beams, none lost"}[name]
+        axes.plot(track["time"], np.hypot(*off.T), color=colour, label=label)
+        axes.plot(track["time"], np.hypot(track["north_sd"], track["east_sd"]), color=colour, linestyle=":")
+    axes.set(yscale="log", xlabel="time [s]", ylabel="horizontal error, dotted: sd [m]", ylim=(0.02, None))
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -309,7 +336,11 @@ def main() -> None:
     parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
     parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
     parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    parser.add_argument("--figure", type=Path, help="draw what losing two beams costs, instead of the table")
     arguments = parser.parse_args()
+    if arguments.figure:
+        draw(arguments.figure)
+        return
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     print("| dive | target | found | met | " + " | ".join(heads) + " | verdicts |")
     print("|---" * (len(heads) + 5) + "|", flush=True)

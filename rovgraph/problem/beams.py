@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as at
@@ -38,6 +38,24 @@ def beam_sensors(config: Config) -> list[str]:
     return ["dvl", *(BEAM_SENSORS[k] for k in geometry.numbers)]
 
 
+def beam_contexts(config: Config, origin_b: ArrayLike) -> Array:
+    """Context of each beam of the configuration, at no altitude, shape (k, BEAM_WIDTH).
+
+    Parameters
+    ----------
+    origin_b : array_like, shape (3,), the point of the body that the state belongs to [m]
+    """
+    geometry = beam_geometry(config.dvl)
+    if geometry is None:
+        return np.zeros((0, at.BEAM_WIDTH))
+    context = np.zeros((len(geometry.numbers), at.BEAM_WIDTH))
+    context[:, at.BEAM_ARM : at.BEAM_ARM + 3] = np.array(config.dvl.lever_arm_m) - np.asarray(origin_b)
+    context[:, at.BEAM : at.BEAM + 3] = geometry.directions
+    context[:, at.BEAM_TILT : at.BEAM_TILT + 3] = geometry.tilts
+    context[:, at.BEAM_AT] = [LAYOUT[f"{BEAM_SENSORS[k]}_angle"].start for k in geometry.numbers]
+    return context
+
+
 class PingsByBeams:
     """Makes measurements along beams.
 
@@ -52,13 +70,7 @@ class PingsByBeams:
         self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, DvlBeam)}
         geometry = beam_geometry(config.dvl) if self.instruments else None
         self._numbers = () if geometry is None else geometry.numbers
-        self._context = np.zeros((len(self._numbers), at.BEAM_WIDTH))
-        if geometry is not None:
-            origin_b = np.array(config.imu.lever_arm_m)
-            self._context[:, at.BEAM_ARM : at.BEAM_ARM + 3] = np.array(config.dvl.lever_arm_m) - origin_b
-            self._context[:, at.BEAM : at.BEAM + 3] = geometry.directions
-            self._context[:, at.BEAM_TILT : at.BEAM_TILT + 3] = geometry.tilts
-            self._context[:, at.BEAM_AT] = [LAYOUT[f"{BEAM_SENSORS[k]}_angle"].start for k in self._numbers]
+        self._context = beam_contexts(config, config.imu.lever_arm_m)[: len(self._numbers)]
         self.velocities = False  # whether the instrument gives velocities
         self.three = False  # whether it has made one of three beams
 
