@@ -158,7 +158,7 @@ def test_a_dvl_in_its_place_is_left_there():
 
 
 def test_beams_add_the_spurious_information_of_the_velocity_that_they_make():
-    """Each row of a beam has the noise of the rate by itself, so that its information is a little smaller."""
+    """But for the rate's noise, which each row of a beam has by itself."""
     head = {
         "beams": {"angle_deg": 22.5, "azimuth_deg": [135, 225, 315, 45]},
         "velocity_sd_mps": [0.005, 0.005, 0.00146],
@@ -169,5 +169,5 @@ def test_beams_add_the_spurious_information_of_the_velocity_that_they_make():
         for use in ("beams", "velocity")
     )
     ratio = along.information / whole.information
-    assert (ratio > 0.6).all() and (ratio < 1.05).all()
+    assert (ratio > 0.7).all() and (ratio < 1.2).all()
     assert np.allclose(along.score / whole.score, ratio, rtol=0.1)
