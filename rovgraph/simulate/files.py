@@ -46,11 +46,11 @@ def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]
     summary : entries of ``summary.json`` beside the figures of the dive
     """
     log = dive.log_frame
-    single = [name for name in log if name.startswith(PREFIX)]
+    single = [name for name in map(str, log) if name.startswith(PREFIX)]
     write_log(log.drop(columns=single), folder / "log.csv")
     if single:
         beams = log.loc[log[single].notna().any(axis=1), ["time", *single]]
-        beams.columns = pd.Index([name.removeprefix(PREFIX) for name in beams])
+        beams.columns = pd.Index([str(name).removeprefix(PREFIX) for name in beams])
         beams.round(DECIMALS["time"]).to_csv(table_beside(folder / "log.csv", BEAMS), index=False)
     step = max(round(1.0 / (TRUTH_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
     dive.truth.every(step).write_csv(folder / "truth.csv")
