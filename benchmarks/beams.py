@@ -350,11 +350,19 @@ def main() -> None:
     if arguments.figure:
         draw(arguments.figure)
         return
+    if "cost" in arguments.rows:
+        beams, velocity = cost(3)
+        met = "yes" if beams <= 1.6 * velocity else "**no**"
+        print(f"A ping by beams takes {1e6 * beams:.0f} us, by velocity {1e6 * velocity:.0f} us: ", end="")
+        print(f"{beams / velocity:.2f} times (at most 1.6: {met}).\n", flush=True)
+        arguments.rows.remove("cost")
+    if not arguments.rows:
+        return
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     print("| dive | target | found | met | " + " | ".join(heads) + " | verdicts |")
     print("|---" * (len(heads) + 5) + "|", flush=True)
     with workers(arguments.jobs) as pool:
-        for name in (row for row in arguments.rows if row != "cost"):
+        for name in arguments.rows:
             with starting():
                 futures = {
                     dive: [
@@ -372,11 +380,6 @@ def main() -> None:
                     folder = arguments.keep / f"{name}, {dive}".replace(" ", "_").replace("%", "").replace(",", "")
                     folder.mkdir(parents=True, exist_ok=True)
                     write_dive(make_dive(setting, 0), folder)
-    if "cost" in arguments.rows:
-        beams, velocity = cost(3)
-        met = "yes" if beams <= 1.6 * velocity else "**no**"
-        print(f"\nA ping by beams takes {1e6 * beams:.0f} us, by velocity {1e6 * velocity:.0f} us: ", end="")
-        print(f"{beams / velocity:.2f} times (at most 1.6: {met}).")
 
 
 if __name__ == "__main__":

@@ -86,6 +86,6 @@ def test_lost_pings_have_no_beams():
 def test_the_files_of_a_dive_have_its_beams_beside_the_log(tmp_path):
     made = rg.simulate("straight", STATED, 1, rg.Choices(duration=40.0))
     made.save(tmp_path / "dive")
-    log = rg.read_log(tmp_path / "dive" / "log.csv")
+    log = rg.read_log(tmp_path / "dive" / "log.csv", rg.load_config(tmp_path / "dive" / "config.yaml"))
     assert "dvl_beam_velocity_0" not in (tmp_path / "dive" / "log.csv").read_text(encoding="utf-8").splitlines()[0]
     np.testing.assert_allclose(log.streams[BEAMS].data, made.log.streams[BEAMS].data, rtol=0.0, atol=6e-5)
