@@ -18,7 +18,15 @@ from rovgraph.geometry import Array
 from rovgraph.log import Stream
 from rovgraph.model.config import Config, parse_config
 from rovgraph.problem.beams import beam_sensors
-from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams, velocity_by_beams
+from rovgraph.sensors.dvl_beam import (
+    BEAMS,
+    Refusals,
+    beam_geometry,
+    beam_sd,
+    beams_of,
+    taken_by_beams,
+    velocity_by_beams,
+)
 
 # of velocity by four beams at 22.5 deg with 5.4 mm/s [m/s]
 SD = (0.0054 / np.sqrt([2.0 * np.sin(np.deg2rad(22.5)) ** 2] * 2 + [4.0 * np.cos(np.deg2rad(22.5)) ** 2])).tolist()
@@ -93,28 +101,51 @@ def test_three_beams_have_a_velocity_without_error_and_two_have_none():
     assert np.isnan(velocity[1]).all() and np.isnan(error).all()
 
 
+AGREES, CHOOSES = Refusals(True, 2, 0), Refusals(True, 5, 5)  # most of the refused pings so far agree, and half
+
+
 @pytest.mark.parametrize(
-    ("accepted", "off", "valid", "refuses_three", "taken"),
+    ("accepted", "off", "valid", "seen", "taken"),
     [
-        (1.0, 0.1, 4, True, 4),  # it has made a velocity: gates judge its beams
-        (0.0, 0.0, 4, True, 4),  # refused, and yet its beams agree
-        (0.0, 0.05, 4, True, 0),  # refused, and they do not
-        (0.0, 0.0, 3, True, 0),  # it makes velocities of three, and has not
-        (0.0, 0.0, 3, False, 3),  # it never does
-        (0.0, 0.0, 2, True, 2),  # which it cannot make one of
-        (np.nan, 0.1, 4, True, 4),  # it says nothing
+        (1.0, 0.1, 4, CHOOSES, 4),  # it has made a velocity: gates judge its beams
+        (0.0, 0.0, 4, AGREES, 4),  # refused, and yet its beams agree as those of most do
+        (0.0, 0.0, 4, CHOOSES, 0),  # refused, and agrees by chance
+        (0.0, 0.05, 4, AGREES, 0),  # refused, and they do not
+        (0.0, 0.0, 3, CHOOSES, 0),  # it makes velocities of three or refuses four: it has its reasons
+        (0.0, 0.0, 3, Refusals(), 3),  # it never does
+        (0.0, 0.0, 2, CHOOSES, 2),  # which it cannot make one of
+        (np.nan, 0.1, 4, CHOOSES, 4),  # it says nothing
     ],
 )
 def test_what_the_instrument_refused_is_not_readmitted_as_its_beams_call_themselves_valid(
-    accepted, off, valid, refuses_three, taken
+    accepted, off, valid, seen, taken
 ):
     config = parse_config(f"dvl: {{velocity_sd_mps: [0.01, 0.01, 0.01], beams: {JANUS}}}")
     cells = np.full((1, 9, 5), np.nan)
     cells[0, :4, 0], cells[0, :4, 1] = np.arange(4) < valid, [0.1 + off, 0.1, 0.1, 0.1]
     beams = beams_of(cells.reshape(1, -1), range(4))
-    assert taken_by_beams(beams, np.array([accepted]), config.dvl, refuses_three).sum() == taken
-    assert taken_by_beams(beams, np.array([accepted]), changed(config, dvl={"use": "beams"}).dvl, True).sum() == valid
-    assert not taken_by_beams(beams, np.array([accepted]), changed(config, dvl={"use": "velocity"}).dvl, True).any()
+
+    def count(use: str) -> int:
+        dvl = changed(config, dvl={"use": use}).dvl
+        return int(taken_by_beams(beams, np.array([accepted]), dvl, seen)[0].sum())
+
+    assert (count("auto"), count("beams"), count("velocity")) == (taken, valid, 0)
+
+
+def test_what_is_seen_of_refused_pings_is_the_same_one_by_one():
+    config = parse_config(f"dvl: {{velocity_sd_mps: [0.01, 0.01, 0.01], beams: {JANUS}}}")
+    rng = np.random.default_rng(1)
+    cells = np.full((200, 9, 5), np.nan)
+    cells[:, :4, 0], cells[:, :4, 1] = rng.uniform(size=(200, 4)) < 0.9, 0.1
+    cells[:, 0, 1] += np.where(rng.uniform(size=200) < 0.3, 0.05, 0.0)
+    beams, accepted = beams_of(cells.reshape(200, -1), range(4)), (rng.uniform(size=200) < 0.5).astype(float)
+    taken, whole = taken_by_beams(beams, accepted, config.dvl, Refusals())
+    single = Refusals()
+    for k, row in enumerate(cells):
+        ping = beams_of(row.reshape(1, -1), range(4))
+        one, single = taken_by_beams(ping, accepted[k : k + 1], config.dvl, single)
+        np.testing.assert_array_equal(one[0], taken[k])
+    assert whole == single and taken[accepted == 0.0].any()
 
 
 def without_fore(begin: float, end: float) -> Callable[[Array, Array], None]:

@@ -155,3 +155,19 @@ def test_a_dvl_in_its_place_is_left_there():
     dive = moved_by_noise(0.0)
     assert not any("elsewhere" in line for line in dive.assumptions)
     assert not dive.initial.revealed.calibration
+
+
+def test_beams_add_the_spurious_information_of_the_velocity_that_they_make():
+    """But for the rate's noise, which each row of a beam has by itself."""
+    head = {
+        "beams": {"angle_deg": 22.5, "azimuth_deg": [135, 225, 315, 45]},
+        "velocity_sd_mps": [0.005, 0.005, 0.00146],
+    }
+    case = simulated(falcon(dvl=head), 60.0, style=CALM, calibration={ARM: [0.0, 0.0, 0.0]})
+    along, whole = (
+        spurious_information(batch(case.log, started(case, dvl={"use": use})).optimum())
+        for use in ("beams", "velocity")
+    )
+    ratio = along.information / whole.information
+    assert (ratio > 0.7).all() and (ratio < 1.2).all()
+    assert np.allclose(along.score / whole.score, ratio, rtol=0.1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from fault_campaign.beams import Beams, log_columns, ping
 from fault_campaign.earth import Array
 from fault_campaign.motion import Motion, mounting
 from fault_campaign.vehicle import Compass, Vehicle
@@ -108,13 +109,19 @@ def at_arm(motion: Motion, t: Array, arm: Array) -> Array:
     return motion.local(t) + motion.C_nb(t) @ arm
 
 
-def sample(motion: Motion, vehicle: Vehicle, rng: np.random.Generator) -> tuple[Streams, Hidden]:
-    """All instruments of a vehicle on a motion."""
+def sample(
+    motion: Motion, vehicle: Vehicle, rng: np.random.Generator, beams: Beams | None = None
+) -> tuple[Streams, Hidden]:
+    """All instruments of a vehicle on a motion; its DVL as one instrument, or beam by beam."""
     roll, pitch, yaw = vehicle.dvl.mount_rpy_deg
     yaw += rng.normal(0.0, vehicle.dvl.yaw_sd)
     scale = vehicle.dvl.scale + (rng.normal(0.0, vehicle.dvl.scale_sd) if vehicle.dvl.scale_sd else 0.0)
     C_dvl, C_imu = mounting((roll, pitch, yaw)), mounting(vehicle.imu.mount_rpy_deg)
-    streams = {"imu": imu(motion, vehicle, rng), "dvl": dvl(motion, vehicle, C_dvl, scale, rng)}
+    streams = {"imu": imu(motion, vehicle, rng)}
+    if beams is None:
+        streams["dvl"] = dvl(motion, vehicle, C_dvl, scale, rng)
+    else:
+        streams["dvl"] = log_columns(ping(motion, vehicle, beams, C_dvl, scale, rng), beams.head)
     if "ahrs" in vehicle.aids:
         streams["ahrs"] = compass(motion, vehicle, vehicle.ahrs, C_imu[:, 0], rng)
         streams["ahrs"].columns = pd.Index(["time", "ahrs_yaw"])

@@ -56,6 +56,7 @@ class Result:
     said : warnings, assumptions, alarms and advice in the order of the command, a line each
     refused : no estimate was made
     verdicts : command ("smooth", "online") -> the worst verdict that it gave
+    found : whatever else a benchmark has read from the results
     """
 
     nees: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -64,6 +65,7 @@ class Result:
     said: tuple[str, ...] = ()
     refused: bool = False
     verdicts: dict[str, str] = field(default_factory=dict)
+    found: dict[str, float] = field(default_factory=dict)
 
     def without_replay(self) -> "Result":
         """What `rovgraph smooth` made of the same dive; all of one that goes through `rovgraph online` alone."""
@@ -145,14 +147,22 @@ class Dive:
     second_file: tuple[str, ...] = ()
 
 
-def run_dive(dive: Dive, online: bool = False) -> Result:
-    """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth."""
+Inspection = Callable[[Path, Dive], dict[str, float]]
+
+
+def run_dive(dive: Dive, online: bool = False, inspect: Inspection | None = None) -> Result:
+    """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth.
+
+    ``inspect`` reads more from the folder, in which out/ and live/ are the results of these commands.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_dive(dive, folder)
         result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
         if dive.second_file or (online and not result.refused):
             result = _online(folder, dive, result)
+        if inspect is not None and not result.refused:
+            result = replace(result, found=inspect(folder, dive))
         return replace(result, said=tuple(line.replace(name, "") for line in result.said))
 
 

@@ -18,9 +18,11 @@ from rovgraph.inference.initialise import TILT
 from rovgraph.log import Log
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import LONGEST_CRUISED_S, motion_model
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
 
 DVL = ("dvl", "dvl_water")
+PINGS = (*DVL, BEAMS)
 TOGETHER_S = 2.0  # of measurements that are kept between silences, so that slow sensors are among them
 
 
@@ -98,12 +100,12 @@ def _merged(gaps: Sequence[AttitudeGap]) -> list[AttitudeGap]:
 def _thinned(log: Log, gaps: Sequence[AttitudeGap]) -> Log:
     """The log without pings in gaps, and with other measurements only at times that leave silences."""
     streams = {sensor: stream for sensor, stream in log.streams.items() if sensor != "imu"}
-    every = np.unique(np.concatenate([stream.time for sensor, stream in streams.items() if sensor not in DVL]))
+    every = np.unique(np.concatenate([stream.time for sensor, stream in streams.items() if sensor not in PINGS]))
     for gap in gaps:
         begins = _spaced(every[_inside(every, gap)], gap)
         for sensor, stream in streams.items():
             since = stream.time[:, None] - begins
-            stays = ((since >= 0.0) & (since <= TOGETHER_S)).any(axis=1) & (sensor not in DVL)
+            stays = ((since >= 0.0) & (since <= TOGETHER_S)).any(axis=1) & (sensor not in PINGS)
             streams[sensor] = stream.take(~_inside(stream.time, gap) | stays)
     return replace(log, streams={**log.streams, **streams})
 

@@ -18,7 +18,11 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.optimum import NEWEST, Optimum, estimated_parts
+from rovgraph.kernels import measurement_row as at
+from rovgraph.model.calibration import BEAM_SENSORS
+from rovgraph.problem.measurements import Measurements
 from rovgraph.sensors.dvl import DvlVelocity, dvl_mounting
+from rovgraph.sensors.dvl_beam import DvlBeam
 
 ARM = "dvl_lever_arm"
 WORTHLESS = 0.5  # share of spurious information beyond which what is left is worth little
@@ -64,22 +68,37 @@ class SpuriousInformation:
 def spurious_information(best: Optimum) -> SpuriousInformation:
     """F and F l of above in a dive, of the admitted measurements with their weights."""
     information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
-    for sensor, block in best.blocks.items():
-        model = block.instrument.model
-        if not isinstance(model, DvlVelocity):
-            continue
-        R_bs = dvl_mounting(best.state.at(block.keyframe))
-        WR = block.W @ np.swapaxes(R_bs, 1, 2)
-        M = np.swapaxes(WR, 1, 2) @ WR
-        part = np.minimum(followed * np.diag(M.mean(axis=0)), MOST_FOLLOWED)
+    dvl = {s: block for s, block in best.blocks.items() if isinstance(block.instrument.model, DvlVelocity | DvlBeam)}
+    found = {sensor: _of_velocity(best, block) for sensor, block in dvl.items()}
+    beams = sum((M.mean(axis=0) for sensor, M in found.items() if sensor in BEAM_SENSORS), np.zeros((3, 3)))
+    for sensor, block in dvl.items():
+        M = found[sensor]
+        part = np.minimum(followed * np.diag(beams if sensor in BEAM_SENSORS else M.mean(axis=0)), MOST_FOLLOWED)
         M *= np.sqrt(np.outer(1.0 - part, 1.0 - part))
         of_one = np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3) - M
         used = best.weights[sensor] * (block.rate_sd < BRIDGED * np.median(block.rate_sd))
         F = np.einsum("n,nij->ij", used * block.rate_sd**2, of_one)
-        arm = np.mean(model.lever_arm_b + np.atleast_2d(best.state.calibration[ARM]), axis=0)
+        arm = np.mean(_arm_b(block) + np.atleast_2d(best.state.calibration[ARM]), axis=0)
         information += np.diag(F)
         score += F @ arm
     return SpuriousInformation(information, score)
+
+
+def _of_velocity(best: Optimum, block: Measurements) -> Array:
+    """M of above for each measurement, of a velocity or along a beam, shape (n, 3, 3)."""
+    model, R_sb = block.model, np.swapaxes(dvl_mounting(best.state.at(block.keyframe)), 1, 2)
+    seen = model.context[:, None, at.BEAM : at.BEAM + 3] @ R_sb if isinstance(model, DvlBeam) else R_sb
+    WR = block.W @ seen
+    return np.asarray(np.swapaxes(WR, 1, 2) @ WR)
+
+
+def _arm_b(block: Measurements) -> Array:
+    """Of the DVL, from the state's origin, shape (3,) [m]."""
+    model = block.at(slice(0, 1)).model
+    if isinstance(model, DvlBeam):
+        return model.context[0, at.BEAM_ARM : at.BEAM_ARM + 3]
+    assert isinstance(model, DvlVelocity)
+    return np.asarray(model.lever_arm_b)
 
 
 def _followed(best: Optimum) -> Array:

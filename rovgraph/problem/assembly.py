@@ -38,7 +38,7 @@ from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity, preintegration_params, ticks, wanted
 from rovgraph.problem.problem import Problem, in_body
 from rovgraph.sensors import SENSORS, ModelAiding
-from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.dvl_beam import BEAMS, Refusals
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import of_instrument
 
@@ -494,7 +494,7 @@ class Assembly:
             "signals": pack(twin._signals),
             "ship": self._acoustics.state(),
             "waiting": pack(self._acoustics.waiting),
-            "beams": [self._beams.velocities, self._beams.three],
+            "beams": [self._beams.velocities, *self._beams.refusals],
             "context": self._context,
             "assumed": self.time_offsets.assumed,
         }
@@ -531,7 +531,8 @@ class Assembly:
         if "ship" in state:
             self._acoustics.restore(state["ship"])
             self._acoustics.waiting = unpack(state["waiting"])
-        self._beams.velocities, self._beams.three = state.get("beams", (False, False))
+        self._beams.velocities, *seen = state.get("beams", (False,))
+        self._beams.refusals = Refusals(*seen)
         self._periods, self._steps[:] = [], math.inf
         for period in state["periods"]:
             self._take_period(period)

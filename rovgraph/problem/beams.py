@@ -10,7 +10,7 @@ from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
@@ -25,6 +25,7 @@ from rovgraph.sensors.dvl_beam import (
     BEAMS,
     BeamGeometry,
     Beams,
+    Refusals,
     beam_geometry,
     beam_sd,
     beams_of,
@@ -121,6 +122,24 @@ def _of_velocities(
     return WrongHead("contradiction", differs, "check dvl.beams and the axes of the velocity (rovgraph check)")
 
 
+def beam_contexts(config: Config, origin_b: ArrayLike) -> Array:
+    """Context of each beam of the configuration, at no altitude, shape (k, BEAM_WIDTH).
+
+    Parameters
+    ----------
+    origin_b : array_like, shape (3,), the point of the body that the state belongs to [m]
+    """
+    geometry = beam_geometry(config.dvl)
+    if geometry is None:
+        return np.zeros((0, at.BEAM_WIDTH))
+    context = np.zeros((len(geometry.numbers), at.BEAM_WIDTH))
+    context[:, at.BEAM_ARM : at.BEAM_ARM + 3] = np.array(config.dvl.lever_arm_m) - np.asarray(origin_b)
+    context[:, at.BEAM : at.BEAM + 3] = geometry.directions
+    context[:, at.BEAM_TILT : at.BEAM_TILT + 3] = geometry.tilts
+    context[:, at.BEAM_AT] = [LAYOUT[f"{BEAM_SENSORS[k]}_angle"].start for k in geometry.numbers]
+    return context
+
+
 class PingsByBeams:
     """Makes measurements along beams.
 
@@ -136,15 +155,9 @@ class PingsByBeams:
         self._numbers = () if geometry is None else geometry.numbers
         usable = {BEAM_SENSORS[k] for k in self._numbers}
         self.instruments = {s: i for s, i in instruments.items() if s in usable}
-        self._context = np.zeros((len(self._numbers), at.BEAM_WIDTH))
-        if geometry is not None:
-            origin_b = np.array(config.imu.lever_arm_m)
-            self._context[:, at.BEAM_ARM : at.BEAM_ARM + 3] = np.array(config.dvl.lever_arm_m) - origin_b
-            self._context[:, at.BEAM : at.BEAM + 3] = geometry.directions
-            self._context[:, at.BEAM_TILT : at.BEAM_TILT + 3] = geometry.tilts
-            self._context[:, at.BEAM_AT] = [LAYOUT[f"{BEAM_SENSORS[k]}_angle"].start for k in self._numbers]
+        self._context = beam_contexts(config, config.imu.lever_arm_m)
         self.velocities = False  # whether the instrument gives velocities
-        self.three = False  # whether it has made one of three beams
+        self.refusals = Refusals()
 
     def of(self, pings: Stream, accepted: Array) -> list[Stream]:
         """Measurements of each beam: component, its sd, context and no name, shape (k, 3 + BEAM_WIDTH).
@@ -156,8 +169,7 @@ class PingsByBeams:
             velocities, a ping without one is refused
         """
         beams = beams_of(pings.data, self._numbers)
-        self.three |= bool(((beams.valid.sum(axis=1) == 3) & (accepted == 1.0)).any())
-        taken = taken_by_beams(beams, accepted, self.config.dvl, self.three)
+        taken, self.refusals = taken_by_beams(beams, accepted, self.config.dvl, self.refusals)
         down = np.where(np.isfinite(beams.distance), beams.distance, beams.range * self._context[:, at.BEAM + 2])
         seen = np.isfinite(down)
         altitude = np.where(seen, down, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)

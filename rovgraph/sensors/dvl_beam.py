@@ -30,6 +30,7 @@ QUANTITIES = "valid", "velocity", "range", "distance", "sd"  # of each beam, in 
 PHASED_C0 = 1536.0  # speed of sound for which a phased array is spaced, with beams of 30 deg [m/s]
 USUAL_C = 1500.0  # of a phased array where none is stated [m/s]
 ERROR_GATE = 3.0  # sds of the error velocity, up to which four beams that the instrument refused are taken
+MOSTLY = 3  # so many more refused pings agree than disagree, where they are taken
 RATE_SHARE = 2.0**0.5  # beams of a ping share the noise of the rate, each row has it by itself
 
 
@@ -203,11 +204,26 @@ def velocity_by_beams(directions: Array, velocity: Array, valid: NDArray[np.bool
     return out, error
 
 
-def taken_by_beams(beams: Beams, accepted: Array, dvl: Dvl, refuses_three: bool) -> NDArray[np.bool_]:
-    """Which beams of n pings enter the estimate, shape (n, k); a ping with any of them is not taken by its velocity.
+class Refusals(NamedTuple):
+    """What has been seen of the pings that a DVL refuses.
+
+    Attributes
+    ----------
+    chooses : it refuses by more than the number of beams: it has made a velocity of three, or refused one of four
+    agreeing, disagreeing : how many pings of four beams and more it has refused, by what their beams say of each other
+    """
+
+    chooses: bool = False
+    agreeing: int = 0
+    disagreeing: int = 0
+
+
+def taken_by_beams(beams: Beams, accepted: Array, dvl: Dvl, seen: Refusals) -> tuple[NDArray[np.bool_], Refusals]:
+    """Which beams of n pings enter the estimate; a ping with any of them is not taken by its velocity.
 
     What the instrument itself refused with three beams or more is not readmitted because its beams call themselves
-    valid: of 57 such pings of an A50, 40 had four valid beams and were 0.1 to 0.4 m/s off.
+    valid: of 57 such pings of an A50, 40 had four valid beams and were 0.1 to 0.4 m/s off. Four beams of such a ping
+    agree by chance once in ten, so that agreement counts where most of the refused pings so far have it.
 
     Parameters
     ----------
@@ -215,19 +231,29 @@ def taken_by_beams(beams: Beams, accepted: Array, dvl: Dvl, refuses_three: bool)
     accepted : ndarray, shape (n,), the instrument's own word: 1 = it gives a velocity, 0 = it refuses one, NaN = it
         says nothing
     dvl : section of the configuration
-    refuses_three : the instrument makes velocities of three beams, so that it has refused those that it does not make
+    seen : before these pings
+
+    Returns
+    -------
+    taken : ndarray of bool, shape (n, k)
+    seen : with these pings
     """
     geometry = beam_geometry(dvl)
     if geometry is None or dvl.use == "velocity":
-        return np.zeros(beams.valid.shape, bool)
+        return np.zeros(beams.valid.shape, bool), seen
     good = beams.valid & np.isfinite(beams.velocity) & (np.abs(beams.velocity) <= dvl.max_speed_mps)
     if dvl.use == "beams":
-        return np.asarray(good)
+        return np.asarray(good), seen
     places = [geometry.numbers.index(k) for k in beams.numbers]
     _, error = velocity_by_beams(geometry.directions[places], beams.velocity, good)
     count = good.sum(axis=1)
-    agree = np.where(count > 3, error <= ERROR_GATE * beam_sd(dvl), count < (3 if refuses_three else 4))
-    return np.asarray(good & ((accepted != 0.0) | agree)[:, None])
+    four, agree = (accepted == 0.0) & (count > 3), error <= ERROR_GATE * beam_sd(dvl)
+    chooses = seen.chooses | np.logical_or.accumulate(four | ((accepted == 1.0) & (count == 3)))
+    more = seen.agreeing - seen.disagreeing + np.cumsum(np.where(agree, 1, -1) * four)
+    kinds = int((four & agree).sum()), int((four & ~agree).sum())
+    after = Refusals(bool(seen.chooses or chooses.any()), seen.agreeing + kinds[0], seen.disagreeing + kinds[1])
+    agree = np.where(count > 3, agree & (more >= MOSTLY), count < np.where(chooses, 3, 4))
+    return np.asarray(good & ((accepted != 0.0) | agree)[:, None]), after
 
 
 def _has_any(values: Array) -> NDArray[np.bool_]:

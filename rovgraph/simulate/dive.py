@@ -27,10 +27,13 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, earth_rate_n, rotate, rpy_from_matrix, transpose, wrap_angle
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.model.calibration import ACOUSTICS
+from rovgraph.kernels import measurement_row as at
+from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS
 from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
 from rovgraph.model.state import State
+from rovgraph.problem.beams import beam_contexts
 from rovgraph.sensors import SENSORS, field_direction
+from rovgraph.sensors.dvl_beam import beam_columns, beam_geometry, beam_sd, velocity_by_beams
 from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate.acoustic import AcousticSampler, has_acoustics, lay_beacons, ship_path
 from rovgraph.simulate.environment import compass_turn
@@ -148,6 +151,8 @@ WATER_COLUMNS = ["dvl_water_vx", "dvl_water_vy", "dvl_water_vz"]
 TIME_STEP = 1e-4  # resolution of the log's clock [s]
 PASSING_STEP = 0.02  # between epochs at which it is seen whether a place is near [s]
 COMPASS_RATE = 10.0  # of compasses that only the configuration names [Hz]
+BOTTOM_BELOW_M = 5.0  # the deepest point of a path, for a DVL's beams
+RANGE_SD_M = 0.02  # of a beam
 AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
 
 
@@ -189,6 +194,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     rng : numpy Generator; the same seed gives the same dive
     """
     acoustic = rng.spawn(1)[0] if has_acoustics(truth.config) else None  # the dives of old seeds stay
+    single = rng.spawn(1)[0] if beam_geometry(truth.config.dvl) is not None else None
     if acoustic is not None:
         places = lay_beacons(truth.config, path, acoustic if truth.noise else None)
         truth = replace(truth, calibration={**places, **truth.calibration})
@@ -202,7 +208,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     if truth.noise:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, lasting, rng)
-    frames = [_inertial(sample, path, motion, bias), _pings(sample, path)]
+    frames = [_inertial(sample, path, motion, bias), _pings(sample, path, single)]
     makers = (_depths, _attitudes, _autopilot_headings, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
@@ -211,10 +217,13 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     calibration |= {name: values[-1] for name, values in lasting.at(time).items()}
+    geometry = beam_geometry(truth.config.dvl)
+    heads = () if geometry is None else tuple(BEAM_SENSORS[k] for k in geometry.numbers)
+    missing = {*BEAM_SENSORS} - {*heads} | ({*ACOUSTICS} if acoustic is None else set())
     absent = {
         name
         for name, belief in beliefs(truth.config).items()
-        if belief.streams == () or (acoustic is None and {*belief.variable.sensors} <= {*ACOUSTICS})
+        if belief.streams == () or {*belief.variable.sensors} <= missing
     }
     calibration = {name: value for name, value in calibration.items() if name not in absent}
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
@@ -339,8 +348,8 @@ def _inertial(sample: _Sampler, path: Path, motion: Motion, bias: Array) -> pd.D
     return _frame(motion.time, IMU_COLUMNS + MAG_COLUMNS, np.hstack([values, field]))
 
 
-def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
-    """DVL velocity, its validity and its compass, one row per ping."""
+def _pings(sample: _Sampler, path: Path, single: np.random.Generator | None) -> pd.DataFrame:
+    """DVL velocity, its validity and its compass, one row per ping; each beam where ``single`` draws its noise."""
     truth, rng = sample.truth, sample.rng
     stamps = sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter)
     motion = sample.motion("dvl", path, stamps)
@@ -353,11 +362,13 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
         noise = correlated(sample.covariances.dvl, len(motion), rng)
         velocity = velocity + noise[:, :3]
     wrong = (rng.uniform(size=len(motion)) < truth.outlier_share) & truth.noise
-    velocity[wrong] += truth.outlier_size * rng.standard_normal((int(wrong.sum()), 3))
-    frame = _frame(stamps, DVL_COLUMNS, velocity)
+    off = np.zeros_like(velocity)
+    off[wrong] = truth.outlier_size * rng.standard_normal((int(wrong.sum()), 3))
     lost = np.zeros(len(motion), bool)
     for begin, end in truth.dropouts:
         lost |= (stamps >= begin) & (stamps <= end)
+    beams = None if single is None else _beams(sample, path, motion, off, lost, single)
+    frame = _frame(stamps, DVL_COLUMNS, velocity + off if beams is None else beams[0])
     frame.loc[lost, DVL_COLUMNS] = np.nan
     frame["dvl_valid"] = pd.array(np.where(lost, 0, 1), dtype="Int64")
     if noise is None:
@@ -367,7 +378,43 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
     frame["dvl_heading"] = heading[:, 0]
     if truth.water_track:
         frame[WATER_COLUMNS] = sample.noisy("dvl_water", motion)
-    return frame
+    return frame if beams is None else pd.concat([frame, beams[1]], axis=1)
+
+
+def _beams(
+    sample: _Sampler, path: Path, motion: Motion, off: Array, lost: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[Array, pd.DataFrame]:
+    """Each beam of n pings over a level bottom, and the velocity that the instrument makes of them, shape (n, 3).
+
+    Parameters
+    ----------
+    off : ndarray, shape (n, 3), error of wrong pings, DVL axes [m/s]
+    lost : ndarray, shape (n,), pings without bottom lock
+    """
+    config, state = sample.truth.config, sample.state(motion)
+    geometry = beam_geometry(config.dvl)
+    assert geometry is not None
+    arm_b, down = np.array(config.dvl.lever_arm_m), geometry.directions @ mount_matrix(config.dvl.mount_rpy_deg).T
+    bottom = float(path.motion(np.linspace(0.0, path.duration, 500)).p_n[:, 2].max()) + BOTTOM_BELOW_M
+    slant = np.einsum("ni,ki->nk", motion.R_nb[:, 2], down)  # cosine of the angle to the vertical
+    above = bottom - motion.p_n[:, 2] - motion.R_nb[:, 2] @ arm_b
+    far = np.where(slant > 0.1, above[:, None] / np.maximum(slant, 0.1), np.nan)
+    context = np.repeat(beam_contexts(config, np.zeros(3))[None], len(motion), axis=0)
+    context[:, :, at.ALTITUDE] = np.nan_to_num((far * geometry.directions[:, 2]).mean(axis=1))[:, None]
+    b = off @ geometry.directions.T
+    for k, number in enumerate(geometry.numbers):
+        model: Any = sample.instruments[BEAM_SENSORS[number]].model
+        exact = model.of(context[:, k]).predict(state, motion.w_b)[0][:, 0]
+        sd = np.hypot(beam_sd(config.dvl), config.dvl.scale_sd * exact)
+        b[:, k] += exact + (sd * rng.standard_normal(len(motion)) if sample.truth.noise else 0.0)
+    if sample.truth.noise:
+        far = far + RANGE_SD_M * rng.standard_normal(far.shape)
+    columns: dict[str, Any] = {}
+    for k, number in enumerate(geometry.numbers):
+        valid, velocity, distance, *_ = beam_columns(number)
+        columns[valid] = pd.array(np.where(lost, 0, 1), dtype="Int64")
+        columns |= {velocity: np.where(lost, np.nan, b[:, k]), distance: np.where(lost, np.nan, far[:, k])}
+    return velocity_by_beams(geometry.directions, b, np.ones(b.shape, bool))[0], pd.DataFrame(columns)
 
 
 def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:
