@@ -195,6 +195,21 @@ def velocity_by_beams(directions: Array, velocity: Array, valid: NDArray[np.bool
     return out, error
 
 
+def error_velocity(data: Array, dvl: Dvl) -> Array:
+    """What the valid beams of n pings disagree by, as `velocity_by_beams` has it, shape (n,) [m/s].
+
+    Parameters
+    ----------
+    data : as of `beams_of`
+    """
+    geometry = beam_geometry(dvl)
+    if geometry is None:
+        return np.full(len(data), np.nan)
+    beams = beams_of(data, geometry.numbers)
+    moving = beams.valid & np.isfinite(beams.velocity)
+    return velocity_by_beams(geometry.directions, beams.velocity, moving)[1]
+
+
 def taken_by_beams(beams: Beams, accepted: Array, dvl: Dvl, refuses_three: bool) -> NDArray[np.bool_]:
     """Which beams of n pings enter the estimate, shape (n, k); a ping with any of them is not taken by its velocity.
 
