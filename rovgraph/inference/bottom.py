@@ -7,13 +7,13 @@ A range meets the bottom at ``p_n + a``, with the arm from the body's origin
 d is the unit vector of the beam and rho the range along it, less the scale error of the DVL where that is one of sound
 speed. ``distance`` and ``dvl_altitude`` are along the DVL's own z axis, as makers state them: rho = distance / d_z.
 
-The bottom about the vehicle is a plane, ``a_down = h + g (a_north, a_east)``, with the altitude h straight down from the
-body's origin and the slope g. It is fitted to the ranges of each ping, with a prior of the slope, so that one range
+The bottom about the vehicle is a plane, ``a_down = h + g (a_north, a_east)``, with the altitude h straight down from
+the body's origin and the slope g. It is fitted to the ranges of each ping, with a prior of the slope, so that one range
 gives an altitude, two a slope along their line, and the sd says what remains unknown. What the errors of attitude,
 mounting and scale do to all ranges of a ping together is part of it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,12 +21,13 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, transpose
+from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
 from rovgraph.model.calibration import BEAM_SENSORS, MOUNT
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.problem.beams import nearest
 from rovgraph.sensors.dvl import TIME_OFFSET
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
@@ -99,9 +100,7 @@ class Bottom:
         dict : `COLUMNS`, each with its ``_sd``, ndarray, shape (len(track),), NaN where no ping is within a second;
             no slope where the ping has one range
         """
-        after = np.searchsorted(self.time, track.time).clip(0, len(self.time) - 1)
-        before = (after - 1).clip(0)
-        near = np.where(track.time - self.time[before] <= self.time[after] - track.time, before, after)
+        near = nearest(self.time, track.time)
         known = np.abs(self.time[near] - track.time) <= NEAREST_S
         moved = track.p_n - self.place[near]
         h = np.column_stack([np.ones(len(track)), moved[:, :2]])
@@ -192,9 +191,7 @@ def bottom_of(log: Log, config: Config, estimate: Estimate) -> Bottom | None:
     return _fitted(numbers, time, rotate(ranges.R_bs, d), rho, here, ranges)
 
 
-def _fitted(
-    numbers: tuple[int, ...], time: Array, u_b: Array, rho: Array, here: Trajectory, ranges: _Ranges
-) -> Bottom:
+def _fitted(numbers: tuple[int, ...], time: Array, u_b: Array, rho: Array, here: Trajectory, ranges: _Ranges) -> Bottom:
     """Soundings and planes of pings, where the track is ``here``."""
     along = rotate(here.R_nb[:, None], u_b[None]) * rho[..., None]
     arm = rotate(here.R_nb, ranges.arm_b)[:, None] + along
@@ -216,11 +213,9 @@ def _fitted(
     cov_plane = inverse + J_theta @ cov_theta @ transpose(J_theta) + scale_sd**2 * J_scale @ transpose(J_scale)
     u_n = along / rho[..., None]
     own = (noise * sd) ** 2 + (scale_sd * rho) ** 2
-    by_attitude = np.cross(arm[..., None, :], np.eye(3))  # row i is arm x e_i, so that theta turns the arm by its columns
-    cov_arm = transpose(by_attitude) @ cov_theta[:, None] @ by_attitude + own[..., None, None] * (
-        u_n[..., :, None] * u_n[..., None, :]
-    )
-    cov_arm = cov_arm + here.cov_p[:, None]
+    S = skew(arm)
+    cov_arm = here.cov_p[:, None] + S @ cov_theta[:, None] @ transpose(S)
+    cov_arm = cov_arm + own[..., None, None] * u_n[..., :, None] * u_n[..., None, :]
     return Bottom(time, numbers, arm, used, here.p_n, cov_arm, plane, cov_plane, noise)
 
 

@@ -2,8 +2,8 @@
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
 v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
-Unix time, ``lat, lon`` if the origin of n on Earth is known, and what else is known at its epochs. TUM files hold ``time x y z qx qy qz qw`` in n, for
-tools such as ``evo_ape``.
+Unix time, ``lat, lon`` if the origin of n on Earth is known, and what else is known at its epochs. TUM files
+hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
 from collections.abc import Mapping

@@ -229,8 +229,7 @@ def write_results(
 
 
 def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen: Sequence[FrozenStretch]) -> None:
-    """Write dvl.csv, dvl_beams.csv and soundings.csv, where there is a DVL, where its beams, and where ranges are known,
-    and left_out.csv."""
+    """Write left_out.csv, and of a DVL dvl.csv, dvl_beams.csv and soundings.csv, as far as each is known."""
     pings = dvl_frame(log, frozen)
     if pings is not None:
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
