@@ -13,6 +13,7 @@ gives an altitude, two a slope along their line, and the sd says what remains un
 mounting and scale do to all ranges of a ping together is part of it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.log import Log
+from rovgraph.log import Log, Stream
 from rovgraph.model.calibration import BEAM_SENSORS, MOUNT
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.problem.beams import nearest
@@ -122,7 +123,7 @@ class Bottom:
 class _Ranges:
     """Ranges of a log in the vehicle's axes, by a configuration and what a dive has revealed of it."""
 
-    def __init__(self, config: Config, calibration: dict[str, tuple[float, float]]) -> None:
+    def __init__(self, config: Config, calibration: Mapping[str, tuple[float, float]]) -> None:
         self._config, self._known = config, calibration
 
     def value(self, label: str, otherwise: float = 0.0) -> float:
@@ -149,21 +150,21 @@ class _Ranges:
         """Of ranges: that of a piston's velocities is one of sound speed."""
         return 1.0 if self._config.dvl.beams.phased else 1.0 + self.value("dvl_scale")
 
-    def of(self, log: Log) -> tuple[tuple[int, ...], Array, Array, Array] | None:
+    def of(self, streams: Mapping[str, Stream]) -> tuple[tuple[int, ...], Array, Array, Array] | None:
         """Numbers, times (n,), unit vectors (k, 3) in the DVL's axes and ranges along them (n, k); None without any."""
         geometry = beam_geometry(self._config.dvl)
-        if geometry is not None and BEAMS in log:
-            beams = beams_of(log[BEAMS].data, geometry.numbers)
+        if geometry is not None and BEAMS in streams:
+            beams = beams_of(streams[BEAMS].data, geometry.numbers)
             angle = np.array([[self.value(f"{BEAM_SENSORS[k]}_angle")] for k in geometry.numbers])
             d = geometry.directions + angle * geometry.tilts
             rho = np.where(np.isfinite(beams.range), beams.range, beams.distance / d[:, 2])
             if np.isfinite(rho).any():
-                return geometry.numbers, log[BEAMS].time, d, rho
-        if "dvl_altitude" not in log:
+                return geometry.numbers, streams[BEAMS].time, d, rho
+        if "dvl_altitude" not in streams:
             return None
-        far = log["dvl_altitude"]["dvl_altitude"]
+        far = streams["dvl_altitude"].data[:, 0]
         rho = np.where(far > 0.0, far, np.nan)[:, None]
-        return ((WHOLE_HEAD,), log["dvl_altitude"].time, np.array([[0.0, 0.0, 1.0]]), rho)
+        return ((WHOLE_HEAD,), streams["dvl_altitude"].time, np.array([[0.0, 0.0, 1.0]]), rho)
 
 
 def bottom_of(log: Log, config: Config, estimate: Estimate) -> Bottom | None:
@@ -178,12 +179,32 @@ def bottom_of(log: Log, config: Config, estimate: Estimate) -> Bottom | None:
     -------
     Bottom, of the pings within the track; None where the log has no range
     """
-    ranges = _Ranges(config, {entry.label: (entry.value, entry.sd) for entry in estimate.calibration})
-    found, track = ranges.of(log), estimate.trajectory
+    calibration = {entry.label: (entry.value, entry.sd) for entry in estimate.calibration}
+    offset = calibration.get(TIME_OFFSET, (0.0, 0.0))[0]
+    return bottom_under(estimate.trajectory, log.streams, config, calibration, offset)
+
+
+def bottom_under(
+    track: Trajectory,
+    streams: Mapping[str, Stream],
+    config: Config,
+    calibration: Mapping[str, tuple[float, float]],
+    late: float = 0.0,
+) -> Bottom | None:
+    """As `bottom_of`, of measurements and a track that need not be a whole dive's.
+
+    Parameters
+    ----------
+    streams : "dvl_beams" or "dvl_altitude"
+    calibration : label of a component -> value and sd
+    late : how late the DVL's stamps are [s]
+    """
+    ranges = _Ranges(config, calibration)
+    found = ranges.of(streams)
     if found is None:
         return None
     numbers, time, d, rho = found
-    time = time - ranges.value(TIME_OFFSET)
+    time = time - late
     some = np.isfinite(rho).any(axis=1) & (time >= track.time[0]) & (time <= track.time[-1])
     if not some.any():
         return None

@@ -486,6 +486,15 @@ class Health:
             for sensor, watch in watches.items()
         }
 
+    def of_beams(self, seen: Mapping[str, float], time: float) -> dict[str, SensorHealth]:
+        """Single beams of the DVL; ``seen`` has when each was valid last [s]."""
+        found = {}
+        for sensor, last in seen.items():
+            lost = time - last if time - last > BEAM_LOST_S else 0.0
+            state = "no lock" if lost else "rejected" if sensor in self._out else "ok"
+            found[sensor] = SensorHealth(state, time - last, self.used[sensor], self.rejected[sensor], lost)
+        return found
+
     def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
         self.events.append(Event(time, sensor, kind, text))
 
@@ -497,6 +506,7 @@ def _failed(watch: Watch, time: float) -> float:
     return time - (watch.time if watch.state == "silent" else watch.entered)
 
 
+BEAM_LOST_S = 2.0  # without a valid velocity along it
 SENSOR = "dvl"
 REJECTIONS, WITHIN_S = 3, 20.0  # so many rejections within that time are no knock
 COHERENT_S = 25.0  # without rejections before
