@@ -1,7 +1,7 @@
 """Small simulated dives for the tests, as `Log` objects that never touch a file."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path as FilePath
@@ -22,6 +22,7 @@ from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.model.config import Config, beliefs, load_config
 from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, velocity_by_beams
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
 
 FALCON = FilePath(__file__).parents[1] / "rovgraph" / "model" / "falcon.yaml"
@@ -171,6 +172,35 @@ def below_a_ship() -> tuple[Log, Config]:
     config = merge(dive.configuration, Acoustic(Ship(), system).ranges(places, 0.5))
     streams = dive.streams | {"range": ranges(dive.motion, places, system, rng)}
     return campaign_log(replace(dive, streams=streams, configuration=config))
+
+
+JANUS = {"angle_deg": 22.5, "azimuth_deg": [135.0, 225.0, 315.0, 45.0], "first_number": 0}
+
+
+def by_beams(
+    log: Log, config: Config, alter: Callable[[Array, Array], None] | None = None, **dvl: Any
+) -> tuple[Log, Config]:
+    """A dive whose DVL has four beams: its velocity along each, with noise, and the velocity that they make.
+
+    Parameters
+    ----------
+    alter : changes (times, shape (n,), velocities along the beams, shape (n, 4)) in place; NaN = not valid
+    dvl : keys of the configuration
+    """
+    config = changed(config, dvl={"beams": JANUS, **dvl})
+    geometry, pings = beam_geometry(config.dvl), log["dvl"]
+    assert geometry is not None
+    noise = np.random.default_rng(7).normal(0.0, beam_sd(config.dvl), (len(pings), 4))
+    along = pings.data[:, :3] @ geometry.directions.T + noise
+    along[pings["dvl_valid"] != 1.0] = np.nan
+    if alter is not None:
+        alter(pings.time, along)
+    valid, data, velocity = np.isfinite(along), np.full((len(pings), 9, 5), np.nan), pings.data.copy()
+    data[:, :4, 0], data[:, :4, 1] = valid, along
+    velocity[:, :3], _ = velocity_by_beams(geometry.directions, np.nan_to_num(along), valid)
+    velocity[:, 3] = np.isfinite(velocity[:, 0])
+    beams = Stream(BEAMS, STREAMS[BEAMS], pings.time, data.reshape(len(pings), -1), pings.row)
+    return replace(log, streams={**log.streams, "dvl": replace(pings, data=velocity), BEAMS: beams}), config
 
 
 def batch(log: Log, config: Config) -> BatchSmoother:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dives import altered, batch, below_a_ship, changed, falcon, interrupted, simulated, started
+from dives import altered, batch, below_a_ship, by_beams, changed, falcon, interrupted, simulated, started
 
 from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.inference import chain_optimum, gauss_newton
@@ -20,7 +20,7 @@ from rovgraph.inference.graph.optimum import GraphOptimum
 from rovgraph.inference.graph.places import smooth_graph
 from rovgraph.inference.optimum import Optimum
 from rovgraph.log import STREAMS, Log, Stream
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import BEAM_SENSORS, TABLE
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.state import BIAS, POSE, VELOCITY
 from rovgraph.sensors import SENSORS
@@ -30,7 +30,7 @@ from rovgraph.simulate.files import write_log
 
 EXACT = 1e-10  # decrease of the cost that is left when both stop here
 # these measure nothing of the vehicle, or where there is no IMU, or have a dive of their own
-UNUSED = "dvl_altitude", "vehicle_tilt", "ship", "ship_heading", "ship_tilt", "usbl", "range"
+UNUSED = "dvl_altitude", "vehicle_tilt", "ship", "ship_heading", "ship_tilt", "usbl", "range", "dvl_beams"
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0}
 WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
 
@@ -112,6 +112,11 @@ def acoustic() -> Case:
     return log, config.changed(calibration=exact)
 
 
+def beams() -> Case:
+    case = simulated(falcon(**estimated("dvl_yaw", "dvl_scale", "dvl_beam_2_angle")), 45.0, seed=6, **SHORT)
+    return by_beams(case.log, case.config)
+
+
 SCENARIOS: dict[str, Callable[[], Case]] = {
     "both compasses and misalignment": both_compasses,
     "calibration that walks": walking,
@@ -122,6 +127,7 @@ SCENARIOS: dict[str, Callable[[], Case]] = {
     "outliers": outliers,
     "every sensor but places": every_sensor,
     "acoustic positioning": acoustic,
+    "beams of the DVL": beams,
 }
 
 
@@ -140,8 +146,11 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
 
 
 IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
-    "every sensor but places": lambda best: {*best.blocks} == {*SENSORS} - {"imu", "place", *UNUSED},
+    "every sensor but places": lambda best: {*best.blocks} == {*SENSORS} - {"imu", "place", *UNUSED, *BEAM_SENSORS},
     "acoustic positioning": lambda best: {"usbl", "range"} <= set(best.blocks),
+    "beams of the DVL": lambda best: (
+        {f"dvl_beam_{k}" for k in range(4)} <= set(best.blocks) and "dvl" not in best.blocks
+    ),
     "both compasses and misalignment": lambda best: {"mag", "dvl_heading"} <= set(best.blocks),
     "calibration that walks": lambda best: best.chain.layout.d > 15,
     "errors that last": lambda best: len(best.chain.unknowns.time_constants) == 3,

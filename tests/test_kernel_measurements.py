@@ -27,6 +27,8 @@ ARM = [0.3, -0.2, 0.5]
 AHRS = [layout.AHRS_OFFSET, layout.AHRS_DEVIATION]
 DVL_COMPASS = [layout.DVL_COMPASS_OFFSET, layout.DVL_COMPASS_DEVIATION]
 
+BEAM = np.array([-0.6, 0.0, 0.8])  # and how it goes with its angle
+
 # name -> equation, number of components, the model's own numbers
 CASES = {
     "dvl": (kernels.DVL, 3, ARM),
@@ -39,6 +41,7 @@ CASES = {
     "place": (kernels.PLACE_OFFSET, 2, ARM),
     "water_velocity": (kernels.WATER_VELOCITY, 2, []),
     "tilt": (kernels.TILT, 2, []),
+    "dvl_beam": (kernels.DVL_BEAM, 1, [*ARM, *BEAM, -0.8, 0.0, -0.6, 1.7, layout.DVL_BEAM + 2]),
 }
 
 

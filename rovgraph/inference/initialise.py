@@ -41,7 +41,6 @@ from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
-from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
@@ -472,17 +471,16 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     assumptions: list[str] = []
     log, config = with_motion_model(log, config, assumptions)
     unusable = unusable_acoustics(config, log.sensors | set(expected))
-    beams = beam_sensors(config) if BEAMS in {*log.sensors, *expected} else []
-    if not log.sensors - unusable.keys() & {"dvl", "fix", *ACOUSTICS, *([BEAMS] if beams else [])}:
+    beams, why_not = beam_sensors(config, log.streams)
+    if not log.sensors - unusable.keys() & {"dvl", "fix", *ACOUSTICS} and not beams:
         raise InputError(
             f"{log.source}: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes, one of them is needed"
             + "".join(f"; {sensor} is left out: {why}" for sensor, why in unusable.items())
         )
     assumptions += [f"{sensor} is left out: {why}" for sensor, why in unusable.items() if sensor in log]
     if beams:
-        assumptions.append(
-            f"pings of the DVL are taken by their beams, {len(beams) - 1} at {config.dvl.beams.angle_deg:g} deg"
-        )
+        assumptions.append(f"pings of the DVL by their {len(beams) - 1} beams, at {config.dvl.beams.angle_deg:g} deg")
+    assumptions += [why_not] if why_not else []
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams}

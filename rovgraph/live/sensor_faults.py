@@ -41,6 +41,7 @@ from rovgraph.live.solution import Event, SensorHealth
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_false_zero
 from rovgraph.log.streams import joined
+from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -160,7 +161,7 @@ class Faults:
         if m.sensor == BEAMS and m.time == self._invalid_ping:
             return Screening(False, count=0)
         verdict = self._look(m)
-        if m.sensor == "dvl" and not verdict.use:
+        if m.sensor == "dvl" and not verdict.use and m.values[3] != 0.0:  # one without lock may have beams
             self._invalid_ping = m.time
         return verdict
 
@@ -474,7 +475,9 @@ class Health:
             self._gap_until = max(self._gap_until, time + 1.0)
 
     def of(self, watches: Mapping[str, Watch], time: float) -> dict[str, SensorHealth]:
-        """All sensors at a time."""
+        """All sensors at a time; beams of a DVL have the watch of their pings."""
+        beams = [sensor for sensor in BEAM_SENSORS if sensor in self.used or sensor in self.rejected]
+        watches = {**watches, **{sensor: watches[BEAMS] for sensor in beams if BEAMS in watches}}
         return {
             sensor: SensorHealth(
                 "rejected" if sensor in self._out and watch.state == "ok" else watch.state,

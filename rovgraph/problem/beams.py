@@ -6,6 +6,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -14,28 +15,108 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement, Stream
+from rovgraph.log.units import UNITS
 from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT
 from rovgraph.model.config import Config
+from rovgraph.model.config_sections import Dvl
 from rovgraph.problem.admission import admitted
 from rovgraph.problem.problem import Problem
-from rovgraph.sensors import DvlBeam
-from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams
+from rovgraph.sensors.dvl_beam import (
+    BEAMS,
+    BeamGeometry,
+    Beams,
+    beam_geometry,
+    beam_sd,
+    beams_of,
+    taken_by_beams,
+)
 from rovgraph.sensors.instruments import Instrument
-from rovgraph.sensors.sensor import LARGEST_SD
+from rovgraph.sensors.sensor import LARGEST_SD, Kind
 
+MOVING, SDS = 0.1, 5.0  # speed at which beams and velocity are compared [m/s], and times the noise of a beam
+AGREES, ENOUGH = 0.15, 20  # part of the speed, and pings
+SAME_STAMPS = 0.5  # share of pings whose beams and velocity have one stamp
+MOST_ORDERED = 5  # beams whose orders are tried
 ONE_PING_S = 0.01  # stamps of beams and velocity of one ping differ by less
 BY_BEAMS = "taken by its beams"
 
 
-def beam_sensors(config: Config) -> list[str]:
-    """The sensors that pings of beams can become: each beam, and the velocity that all of them show.
+def beam_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[str], str]:
+    """The sensors that a log's pings of beams become, each beam and the velocity that all show; and why not, if not so.
 
-    None where the geometry is not known, or velocities are used.
+    ``dvl.use: auto`` takes velocities where beams do not give them.
     """
     geometry = beam_geometry(config.dvl)
-    if geometry is None or config.dvl.use == "velocity":
-        return []
-    return ["dvl", *(BEAM_SENSORS[k] for k in geometry.numbers)]
+    if BEAMS not in streams or config.dvl.use == "velocity":
+        return [], ""
+    beams = beams_of(streams[BEAMS].data)
+    if not np.isfinite(beams.velocity).any():
+        return [], ""
+    if geometry is None:
+        remedy = "state dvl.beams: {angle_deg, azimuth_deg} (docs/beams.md), and pings with two beams count"
+        return [], f"it is not known where the beams of the DVL point, so its velocities are used; {remedy}"
+    if config.dvl.use == "auto" and (found := head_against_velocity(config, streams)) is not None:
+        return [], f"{found.text}, so velocities are used; {found.remedy}"
+    return ["dvl", *(BEAM_SENSORS[k] for k in geometry.numbers)], ""
+
+
+class WrongHead(NamedTuple):
+    """What is wrong with beams by the velocities of the same pings, its kind in a check, and what to do."""
+
+    kind: Kind
+    text: str
+    remedy: str
+
+
+def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> WrongHead | None:
+    """What is wrong with a log's beams, by the velocities that the instrument makes of them; None = nothing is seen."""
+    geometry = beam_geometry(config.dvl)
+    if geometry is None or "dvl" not in streams or not len(streams["dvl"]):
+        return None
+    pings, dvl = streams[BEAMS], streams["dvl"]
+    every, near = beams_of(pings.data), nearest(dvl.time, pings.time)
+    beams, unknown = beams_of(pings.data, geometry.numbers), sorted({*every.numbers} - {*geometry.numbers})
+    if unknown and np.isfinite(every.velocity[:, [every.numbers.index(k) for k in unknown]]).any():
+        numbers, known = ", ".join(map(str, unknown)), ", ".join(map(str, geometry.numbers))
+        text = f"the log has velocities of beams {numbers}, and dvl.beams those of {known}"
+        return WrongHead("axes", text, "correct dvl.beams.azimuth_deg or first_number")
+    same = np.abs(dvl.time[near] - pings.time) < ONE_PING_S
+    if same.mean() < SAME_STAMPS and len(same) >= ENOUGH:
+        text = f"{same.mean():.0%} of the beams' stamps are those of a velocity"
+        return WrongHead("contradiction", text, "state delay_s.dvl_beams, or convert the native files again")
+    return _of_velocities(config.dvl, geometry, beams, dvl.data[near], same)
+
+
+def _of_velocities(
+    dvl: Dvl, geometry: BeamGeometry, beams: Beams, data: Array, same: NDArray[np.bool_]
+) -> WrongHead | None:
+    """The same by the numbers: ``data``, rows of the stream "dvl", which belong to pings of beams where ``same``."""
+    v = data[:, :3]
+    good = same & (data[:, 3] == 1.0) & (np.linalg.norm(v, axis=1) > max(MOVING, SDS * beam_sd(dvl)))
+    good &= beams.valid.all(axis=1) & np.isfinite(beams.velocity).all(axis=1)
+    if np.count_nonzero(good) < ENOUGH:
+        return None
+    along, v = beams.velocity[good], v[good]
+    inverse = np.linalg.pinv(geometry.directions).T
+
+    def off(along: Array) -> float:
+        return float(np.median(np.linalg.norm(along @ inverse - v, axis=1) / np.linalg.norm(v, axis=1)))
+
+    now = off(along)
+    if now < AGREES:
+        return None
+    differs = f"the velocity of the DVL's beams differs from its own by {now:.0%}"
+    for unit, factor in UNITS["speed"].items():
+        for sign, kind in (("", "unit"), ("-", "sign")):
+            if off((-factor if sign else factor) * along) < AGREES:
+                return WrongHead(kind, differs, f"state units: {{dvl_beam_velocity: {sign}{unit}}}")
+    azimuths = dvl.beams.azimuth_deg
+    for order in permutations(range(len(azimuths))) if len(azimuths) <= MOST_ORDERED else ():
+        if off(along[:, list(order)]) < AGREES:
+            fits = [azimuths[order.index(k)] for k in range(len(order))]
+            text = ", ".join(f"{azimuth:g}" for azimuth in fits)
+            return WrongHead("axes", differs, f"state dvl.beams.azimuth_deg: [{text}], which fits")
+    return WrongHead("contradiction", differs, "check dvl.beams and the axes of the velocity (rovgraph check)")
 
 
 class PingsByBeams:
@@ -49,9 +130,10 @@ class PingsByBeams:
 
     def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
         self.config = config
-        self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, DvlBeam)}
-        geometry = beam_geometry(config.dvl) if self.instruments else None
+        geometry = beam_geometry(config.dvl)
         self._numbers = () if geometry is None else geometry.numbers
+        usable = {BEAM_SENSORS[k] for k in self._numbers}
+        self.instruments = {s: i for s, i in instruments.items() if s in usable}
         self._context = np.zeros((len(self._numbers), at.BEAM_WIDTH))
         if geometry is not None:
             origin_b = np.array(config.imu.lever_arm_m)

@@ -15,8 +15,10 @@ from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
 from rovgraph.model.config import Config, beliefs, mount_matrix
+from rovgraph.problem.beams import head_against_velocity
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors.dvl import axes_remedy
+from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry
 
 SIMILAR = 1.1  # times the least error, up to which two orientations are not distinguished
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
@@ -51,6 +53,17 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
     better = found.error[0, found.now] / found.error[k, m]
     yield _mounting(config, k, fit, f"corrected, its acceleration agrees {better:.1f} times better with the IMU's")
     yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
+
+
+def beams(log: Log, config: Config) -> Iterator[Finding]:
+    """The DVL's beams against the velocities of the same pings, which ``dvl.use: auto`` takes where they differ."""
+    if BEAMS not in log or beam_geometry(config.dvl) is None or config.dvl.use == "velocity":
+        return
+    if (found := head_against_velocity(config, log.streams)) is None:
+        yield Finding(BEAMS, "ok", "beams as configured, by the velocities of the same pings")
+    else:
+        kind = found.kind if config.dvl.use == "beams" else ""
+        yield Finding(BEAMS, "warning", f"{found.text}: {found.remedy}", kind)
 
 
 def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
