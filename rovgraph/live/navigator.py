@@ -30,9 +30,8 @@ from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT, MOUNT, TABLE, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.problem.assembly import InsertResult
-from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, restored
-from rovgraph.sensors.dvl_beam import BEAMS, beams_of
+from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
 if TYPE_CHECKING:
     from rovgraph.inference.graph.isam2 import IncrementalEstimator
@@ -96,7 +95,7 @@ class Navigator:
         self._arrival, self._ticked = 0.0, -np.inf
         self._sounded: Measurement | None = None  # newest ranges, or altitude
         self._bottom: Bottom | None = None  # that these show, once a solution has placed them
-        self._beam_seen = dict.fromkeys(beam_sensors(self.config)[1:], -np.inf)  # when each was valid last [s]
+        self._beam_seen: dict[str, float] = {}  # when each was valid last [s]
         self._located = self.config.start.located  # where the fixes count from
 
     @property
@@ -424,20 +423,19 @@ class Navigator:
         if m.sensor == BEAMS:
             beams = beams_of(m.values[None])
             moving = beams.valid[0] & np.isfinite(beams.velocity[0])
-            for number in np.array(beams.numbers)[moving].tolist():
-                if BEAM_SENSORS[number] in self._beam_seen:
-                    self._beam_seen[BEAM_SENSORS[number]] = m.time
-            ranges = bool(np.isfinite([*beams.range[0], *beams.distance[0]]).any()) and bool(self._beam_seen)
+            self._beam_seen |= {BEAM_SENSORS[k]: m.time for k in np.array(beams.numbers)[moving].tolist()}
+            known = np.isfinite([*beams.range[0], *beams.distance[0]]).any()
+            ranges = bool(known) and beam_geometry(self.config.dvl) is not None
         newest = self._sounded
         old = newest is None or newest.sensor != BEAMS or m.time - newest.time > ALTITUDE_S
         if ranges and (old or m.sensor == BEAMS):
             self._sounded, self._bottom = m, None
 
     def _sensors(self) -> dict[str, SensorHealth]:
-        """All sensors, and single beams once one was valid."""
-        heard = max(self._beam_seen.values(), default=-np.inf) > -np.inf
-        beams = self.health.of_beams(self._beam_seen, self.time) if heard else {}
-        return self.health.of(self.faults.watches, self.time) | beams
+        """All sensors, and the single beams that the estimate uses."""
+        used = () if self.engine is None else self.engine.initial.instruments
+        seen = {sensor: self._beam_seen.get(sensor, -np.inf) for sensor in used if sensor in BEAM_SENSORS}
+        return self.health.of(self.faults.watches, self.time) | self.health.of_beams(seen, self.time)
 
     def _below(self, engine: FixedLag, known: Gaussian, t: Trajectory) -> dict[str, float]:
         """Altitude and depth of the bottom by the newest ranges."""

@@ -41,7 +41,6 @@ from rovgraph.live.solution import Event, SensorHealth
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_false_zero
 from rovgraph.log.streams import joined
-from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -475,9 +474,7 @@ class Health:
             self._gap_until = max(self._gap_until, time + 1.0)
 
     def of(self, watches: Mapping[str, Watch], time: float) -> dict[str, SensorHealth]:
-        """All sensors at a time; beams of a DVL have the watch of their pings."""
-        beams = [sensor for sensor in BEAM_SENSORS if sensor in self.used or sensor in self.rejected]
-        watches = {**watches, **{sensor: watches[BEAMS] for sensor in beams if BEAMS in watches}}
+        """All sensors at a time, but for single beams of a DVL."""
         return {
             sensor: SensorHealth(
                 "rejected" if sensor in self._out and watch.state == "ok" else watch.state,
