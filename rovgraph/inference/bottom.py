@@ -208,7 +208,8 @@ def bottom_under(
     some = np.isfinite(rho).any(axis=1) & (time >= track.time[0]) & (time <= track.time[-1])
     if not some.any():
         return None
-    time, rho, here = time[some], rho[some] / ranges.scale, track.clamped(time[some])
+    time, rho = time[some], rho[some] / ranges.scale
+    here = track if np.array_equal(time, track.time) else track.clamped(time)  # of one ping, live
     return _fitted(numbers, time, rotate(ranges.R_bs, d), rho, here, ranges)
 
 
