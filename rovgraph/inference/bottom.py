@@ -164,7 +164,8 @@ class _Ranges:
             return None
         far = streams["dvl_altitude"].data[:, 0]
         rho = np.where(far > 0.0, far, np.nan)[:, None]
-        return ((WHOLE_HEAD,), streams["dvl_altitude"].time, np.array([[0.0, 0.0, 1.0]]), rho)
+        axis = [0.0, 0.0, np.copysign(1.0, self.R_bs[2, 2])]  # of a DVL whose z axis is up it is down, too
+        return ((WHOLE_HEAD,), streams["dvl_altitude"].time, np.array([axis]), rho)
 
 
 def bottom_of(log: Log, config: Config, estimate: Estimate) -> Bottom | None:
@@ -210,12 +211,15 @@ def bottom_under(
         return None
     time, rho = time[some], rho[some] / ranges.scale
     here = track if np.array_equal(time, track.time) else track.clamped(time)  # of one ping, live
-    return _fitted(numbers, time, rotate(ranges.R_bs, d), rho, here, ranges)
+    bottom = _fitted(numbers, time, rotate(ranges.R_bs, d), rho, here, ranges)
+    return bottom if bottom.used.any() else None
 
 
 def _fitted(numbers: tuple[int, ...], time: Array, u_b: Array, rho: Array, here: Trajectory, ranges: _Ranges) -> Bottom:
     """Soundings and planes of pings, where the track is ``here``."""
-    along = rotate(here.R_nb[:, None], u_b[None]) * rho[..., None]
+    u_n = rotate(here.R_nb[:, None], u_b[None])
+    rho = np.where(u_n[..., 2] > 0.0, rho, np.nan)  # what looks up sees the surface
+    along = u_n * rho[..., None]
     arm = rotate(here.R_nb, ranges.arm_b)[:, None] + along
     mount = np.diag([ranges.sd(name) ** 2 for name in MOUNT])
     cov_theta = here.cov_theta + here.R_nb @ mount @ transpose(here.R_nb)
@@ -233,7 +237,6 @@ def _fitted(numbers: tuple[int, ...], time: Array, u_b: Array, rho: Array, here:
     J_scale = G @ np.where(used, (along * normal).sum(axis=-1), 0.0)[..., None]
     scale_sd = ranges.sd("dvl_scale")
     cov_plane = inverse + J_theta @ cov_theta @ transpose(J_theta) + scale_sd**2 * J_scale @ transpose(J_scale)
-    u_n = along / rho[..., None]
     own = (noise * sd) ** 2 + (scale_sd * rho) ** 2
     S = skew(arm)
     cov_arm = here.cov_p[:, None] + S @ cov_theta[:, None] @ transpose(S)

@@ -48,7 +48,7 @@ def _panel(source: DiveSource, title: str, label: str, shown: Sequence[Series]) 
         below = over_bottom(source, "bottom_depth")
         if below is not None:
             drawn.append(bottom_line(source, below, "bottom"))
-            spans.append(span(*below, 1.0))
+            spans.append(span(below[0], below[1], np.zeros_like(below[1]), 0.0))
     limits = axis_limits(spans)
     if limits is not None and shown[0].name == "speed":
         limits = 0.0, limits[1]

@@ -13,6 +13,7 @@ import pandas as pd
 from rovgraph.geometry import Array
 from rovgraph.model.calibration import BEAM_SENSORS, TABLE
 from rovgraph.report.colours import REJECTED, SERIES
+from rovgraph.report.motion import axis_limits
 from rovgraph.report.pages.dive import bottom_line, over_bottom
 from rovgraph.report.pages.page import (
     Item,
@@ -206,7 +207,9 @@ def _profile(source: DiveSource) -> list[Item]:
     drawn.append(line("vehicle", source.clock(track["time"][some]), track["down"][some], DARK))
     note = "The bottom straight under the vehicle by a plane through the ranges of each ping, with one sd to each side."
     labels = (source.clock.label, "depth [m]")
-    return [Panel("Bottom under the track", *labels, drawn, note=note, down=True)]
+    shown = (found.loc[found["used"] == 1, "depth"].to_numpy(float), track["down"])
+    limits = axis_limits([(float(np.nanmin(one)), float(np.nanmax(one))) for one in shown if np.isfinite(one).any()])
+    return [Panel("Bottom under the track", *labels, drawn, note=note, down=True, limits=limits)]
 
 
 def _sensors_with(source: DiveSource, list_of: str, sensors: Sequence[str], kinds: Sequence[str] = ()) -> list[str]:
