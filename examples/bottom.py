@@ -67,6 +67,8 @@ dvl: {{velocity_sd_mps: [0.02, 0.02, 0.01], beams: {{angle_deg: {angle_deg}, azi
 calibration: {{dvl_compass_offset: {{estimate: true, sd_deg: 3}}}}
 """)
 result = rg.smooth(rg.read_log(path, config), config)
+for alarm in result.alarms:
+    print(alarm.text)
 bottom = result.bottom
 if bottom is None:
     sys.exit(f"{path}: has no ranges")

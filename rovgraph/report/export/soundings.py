@@ -91,6 +91,6 @@ def write_geotiff(track: Track, path: Path, options: ExportOptions) -> None:
 
 
 FORMATS = (
-    ExportFormat("xyz", "soundings, XYZ", ".xyz", write_xyz),
+    ExportFormat("xyz", "soundings, XYZ", ".xyz", write_xyz, "gis"),
     ExportFormat("geotiff", "soundings, gridded (GeoTIFF)", ".tif", write_geotiff, "gis", needs_place=True),
 )
