@@ -113,7 +113,11 @@ def acoustic() -> Case:
 
 
 def beams() -> Case:
-    case = simulated(falcon(**estimated("dvl_yaw", "dvl_scale", "dvl_beam_2_angle")), 45.0, seed=6, **SHORT)
+    exact = {name: {"estimate": False} for name, variable in TABLE.items() if variable.considered}
+    config = falcon(
+        **estimated(**exact | {n: {"estimate": True} for n in ("dvl_yaw", "dvl_scale", "dvl_beam_2_angle")})
+    )
+    case = simulated(config, 45.0, seed=6, **SHORT)
     return by_beams(case.log, case.config)
 
 

@@ -11,9 +11,11 @@ from live import flown
 from test_assembly import assembled
 
 from rovgraph.diagnosis.check import examine
+from rovgraph.diagnosis.check.dvl import ranges
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.log import Stream
 from rovgraph.model.config import Config, parse_config
 from rovgraph.problem.beams import beam_sensors
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beam_sd, beams_of, taken_by_beams, velocity_by_beams
@@ -253,3 +255,24 @@ def test_beams_alone_carry_a_dive_without_velocities(case):
     by_both, _ = end(log, config)
     np.testing.assert_allclose(p, by_both, atol=0.05)
     assert (np.abs(p - case.truth.p_n[-1])[:2] < 3.0 * sd[:2]).all()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "factor", "said"),
+    [
+        (2, 1.0 / math.cos(np.deg2rad(22.5)), ""),
+        (2, 1.0, "name the columns distance_K"),
+        (3, 1.0, ""),
+        (3, 1.0 / math.cos(np.deg2rad(22.5)), "name the columns range_K"),
+        (2, 1000.0 / math.cos(np.deg2rad(22.5)), "units: {dvl_beam_range: mm}"),
+    ],
+)
+def test_ranges_in_a_wrong_unit_or_straight_down_for_slant_are_named(case, quantity, factor, said):
+    log, config = dive(case)
+    pings, cells = log[BEAMS], log[BEAMS].data.reshape(-1, 9, 5).copy()
+    cells[:, :4, quantity] = 3.0 * factor * np.array([0.9, 1.1, 1.0, 1.0])  # a bottom that slopes
+    flat = np.full((len(pings), 1), 3.0)
+    altitude = Stream("dvl_altitude", ("dvl_altitude",), pings.time, flat, pings.row)
+    streams = {**log.streams, BEAMS: replace(pings, data=cells.reshape(len(pings), -1)), "dvl_altitude": altitude}
+    found = [f.text for f in ranges(replace(log, streams=streams), config)]
+    assert len(found) == bool(said) and all(said in text for text in found)

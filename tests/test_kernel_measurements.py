@@ -41,7 +41,7 @@ CASES = {
     "place": (kernels.PLACE_OFFSET, 2, ARM),
     "water_velocity": (kernels.WATER_VELOCITY, 2, []),
     "tilt": (kernels.TILT, 2, []),
-    "dvl_beam": (kernels.DVL_BEAM, 1, [*ARM, *BEAM, -0.8, 0.0, -0.6, 1.7, layout.DVL_BEAM + 2]),
+    "dvl_beam": (kernels.DVL_BEAM, 1, [*ARM, *BEAM, -0.8, 0.0, -0.6, 1.7, layout.DVL_BEAM_2_ANGLE]),
 }
 
 

@@ -339,7 +339,7 @@ def _along(state: Epoch, gain: float, below: int, H_out: Array, work: Array) -> 
     H_out[MOTION + DVL_SCALE] = z / gain
     H_out[MOTION + below] = -H_out[VELOCITY]
     H_out[MOTION + below + 1] = -H_out[VELOCITY + 1]
-    return z  # type: ignore[no-any-return]
+    return z
 
 
 @view_helper

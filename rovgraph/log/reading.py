@@ -353,8 +353,8 @@ def _mend_columns(columns: Sequence[Column], data: Array, line: Lines, source: s
     InputError : a flag that is neither 0 nor 1
     """
     for column, values in zip(columns, data.T, strict=False):
-        odd = np.flatnonzero(~np.isnan(values) & (values != 0.0) & (values != 1.0)) if column.flag else ()
-        if len(odd):
+        odd = np.flatnonzero(~np.isnan(values) & (values != 0.0) & (values != 1.0))
+        if column.flag and odd.size:
             raise InputError(
                 f"{source}: line {line[odd[0]]}, column {column.name}: {values[odd[0]]:g}, expected 0 or 1"
             )

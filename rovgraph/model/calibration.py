@@ -155,6 +155,9 @@ def _time_offset(
 
 ACOUSTICS = "usbl", "range"  # log streams
 BEACONS = 8  # that a dive may have
+_CONTROL = "".join(
+    map(chr, range(1, 12))
+)  # letters of what beams of a DVL need; printable ones are for sensors outside
 _MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
 
 
@@ -599,11 +602,11 @@ TABLE: dict[str, Variable] = {
                 "the error velocity of four beams, and position fixes for their mean",
                 considered=True,
             )
-            for k, (beam, letter) in enumerate(zip(BEAM_SENSORS, "EGHIJKLNO", strict=True))
+            for k, (beam, letter) in enumerate(zip(BEAM_SENSORS, _CONTROL, strict=False))
         ),
         Variable(
             "dvl_bias",
-            "P",
+            _CONTROL[9],
             _XYZ,
             "m/s",
             0.001,
@@ -614,7 +617,7 @@ TABLE: dict[str, Variable] = {
         ),
         Variable(
             "dvl_altitude_scale",
-            "Q",
+            _CONTROL[10],
             _ONE,
             "1/m",
             3e-5,

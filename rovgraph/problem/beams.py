@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.geometry import Array, rotate
+from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement, Stream
 from rovgraph.log.units import UNITS
@@ -107,9 +107,11 @@ def _of_velocities(
         return None
     differs = f"the velocity of the DVL's beams differs from its own by {now:.0%}"
     for unit, factor in UNITS["speed"].items():
-        for sign, kind in (("", "unit"), ("-", "sign")):
+        for sign in ("", "-"):
             if off((-factor if sign else factor) * along) < AGREES:
-                return WrongHead(kind, differs, f"state units: {{dvl_beam_velocity: {sign}{unit}}}")
+                return WrongHead(
+                    "sign" if sign else "unit", differs, f"state units: {{dvl_beam_velocity: {sign}{unit}}}"
+                )
     azimuths = dvl.beams.azimuth_deg
     for order in permutations(range(len(azimuths))) if len(azimuths) <= MOST_ORDERED else ():
         if off(along[:, list(order)]) < AGREES:
@@ -223,7 +225,7 @@ def solved_pings(problem: Problem) -> SolvedPings:
     span = np.linalg.eigvalsh(information)
     whole = span[:, 0] > 1e-3 * span[:, 2]
     covariance = np.linalg.inv(information[whole])
-    velocity = rotate(covariance, seen[whole])
+    velocity = np.einsum("nij,nj->ni", covariance, seen[whole])
     return SolvedPings(rows[first[whole]], velocity, np.diagonal(covariance, axis1=1, axis2=2))
 
 

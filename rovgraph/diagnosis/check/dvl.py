@@ -14,11 +14,12 @@ from rovgraph.diagnosis.check.findings import Finding, believed_lag
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
+from rovgraph.log.units import UNITS
 from rovgraph.model.config import Config, beliefs, mount_matrix
-from rovgraph.problem.beams import head_against_velocity
+from rovgraph.problem.beams import ENOUGH, ONE_PING_S, head_against_velocity, nearest
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors.dvl import axes_remedy
-from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry
+from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
 SIMILAR = 1.1  # times the least error, up to which two orientations are not distinguished
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
@@ -64,6 +65,35 @@ def beams(log: Log, config: Config) -> Iterator[Finding]:
     else:
         kind = found.kind if config.dvl.use == "beams" else ""
         yield Finding(BEAMS, "warning", f"{found.text}: {found.remedy}", kind)
+
+
+def ranges(log: Log, config: Config) -> Iterator[Finding]:
+    """Ranges of beams against its altitude: unit, and whether they are along the beam or straight down."""
+    geometry = beam_geometry(config.dvl)
+    if geometry is None or not {BEAMS, "dvl_altitude"} <= log.sensors:
+        return
+    pings, altitude = log[BEAMS], log["dvl_altitude"]
+    near = nearest(altitude.time, pings.time)
+    high = altitude.data[near, 0]
+    usable = (np.abs(altitude.time[near] - pings.time) < ONE_PING_S) & (high > 0.0)
+    beams, cosine = beams_of(pings.data, geometry.numbers), float(geometry.directions[:, 2].mean())
+    for name, other, measured, expected in (
+        ("range", "distance", beams.range, 1.0 / cosine),
+        ("distance", "range", beams.distance, cosine),
+    ):
+        whole = usable & np.isfinite(measured).all(axis=1)  # a slope and a tilt cancel in the mean of all beams
+        if np.count_nonzero(whole) < ENOUGH:
+            continue
+        ratio = float(np.median(measured[whole].mean(axis=1) / high[whole]))
+        right = 1.0 / cosine if name == "range" else 1.0
+        if abs(np.log(ratio * expected / right)) < 0.25 * abs(np.log(cosine)):
+            text = f"dvl_beam_{name}_K is {ratio:.3g} times dvl_altitude, as {other}s are: name the columns {other}_K"
+            yield Finding(BEAMS, "warning", text)
+        elif abs(np.log(ratio / right)) > np.log(2.0):
+            unit = next((u for u, factor in UNITS["length"].items() if abs(np.log(ratio * factor / right)) < 0.3), None)
+            text = f"dvl_beam_{name}_K is {ratio:.3g} times dvl_altitude, expected {right:.3g}"
+            remedy = "check their columns" if unit is None else f"state units: {{dvl_beam_range: {unit}}}"
+            yield Finding(BEAMS, "warning", f"{text}: {remedy}")
 
 
 def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
