@@ -1,9 +1,8 @@
-import re
-
 """The commands check and config as a user meets them: exit code, one line, no traceback."""
 
 import gzip
 import json
+import re
 import sys
 from pathlib import Path
 

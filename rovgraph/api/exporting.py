@@ -25,6 +25,7 @@ def export(
     force: bool = False,
     origin: tuple[float, float] | None = None,
     surface: float = 0.0,
+    cell: float | None = None,
 ) -> list[Path]:
     """Write the track of a dive in formats that others open (docs/export.md).
 
@@ -35,11 +36,12 @@ def export(
     out : folder to write into; None = the results folder
     estimate : "smoothed", "filtered" or "dead_reckoning"; None = the best available
     rate : of points [Hz]; None = each format's default
-    crs : coordinates of GeoPackage and shapefile, such as "EPSG:25832" or "utm"
+    crs : coordinates of GeoPackage, shapefile and soundings, such as "EPSG:25832" or "utm"
     unix_offset : Unix time of the log's time 0 [s]
     force : replace older files
     origin : latitude and longitude of north = east = 0 [deg]; None = that of the results
     surface : height of the water's surface above sea level [m], for heights in a lake
+    cell : width of the cells of a grid of soundings [m]; None = 1 m
 
     Returns
     -------
@@ -55,7 +57,7 @@ def export(
         if not isinstance(results, str | Path):
             raise InputError("out: expected a folder to write into, because these results have none")
         out = results
-    return write_track(track, as_texts(to, "to"), as_path(out, "out"), ExportOptions(rate, crs), force)
+    return write_track(track, as_texts(to, "to"), as_path(out, "out"), ExportOptions(rate, crs, cell), force)
 
 
 def tag(

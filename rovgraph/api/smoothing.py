@@ -15,6 +15,7 @@ from rovgraph.dive import DiveEstimates
 from rovgraph.dive import smooth as smooth_dive
 from rovgraph.errors import InputError, as_path, as_texts, collected_warnings
 from rovgraph.geometry import Array
+from rovgraph.inference.bottom import Bottom, bottom_of
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.log import Log
 from rovgraph.model.config import Config
@@ -154,6 +155,11 @@ class Result:
         return self.dive.initial.config
 
     @property
+    def bottom(self) -> Bottom | None:
+        """The bottom under the main track, by the DVL's ranges: soundings, altitude, slope; None without ranges."""
+        return bottom_of(self.log, self.config, self.main)
+
+    @property
     def plot(self) -> "Plot":
         """Depth, heading, track and more on matplotlib axes: ``result.plot.depth(axes)``; see `Plot`."""
         from rovgraph.report.figures import Plot  # loads matplotlib
@@ -175,7 +181,10 @@ class Result:
         beacons = [str(beacon.name) for beacon in self.config.beacons]
         acoustics = acoustics_of(self.main.replies, places, beacons) if len(self.main.replies) else None
         fixes = fixes_of(self.main.residuals)
-        return Track(name, chosen.kind, chosen.trajectory, self.log.origin, fixes, acoustics=acoustics)
+        bottom = bottom_of(self.log, self.config, chosen)
+        soundings = None if bottom is None else bottom.soundings
+        origin = self.log.origin
+        return Track(name, chosen.kind, chosen.trajectory, origin, fixes, acoustics=acoustics, soundings=soundings)
 
     def save(
         self,

@@ -111,7 +111,7 @@ def export(
     ] = None,
     rate: Annotated[float | None, typer.Option(help="points a second; default: the format's")] = None,
     crs: Annotated[
-        str | None, typer.Option(help="coordinates of gpkg and shp, such as EPSG:25832, or utm; default: lat, lon")
+        str | None, typer.Option(help="coordinates of gpkg, shp, xyz and geotiff, such as EPSG:25832, or utm")
     ] = None,
     unix_offset: Annotated[
         float, typer.Option(help="Unix time of the log's time 0 in seconds, for formats that need it")
@@ -123,9 +123,10 @@ def export(
     surface: Annotated[
         float, typer.Option(help="height of the water's surface above sea level in metres, of a lake")
     ] = 0.0,
+    cell: Annotated[float | None, typer.Option(help="width of the cells of geotiff in metres; default: 1")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
 ) -> None:
-    """Write a track as KML, GeoJSON, GPX, GeoPackage, NMEA, ROS 2 bag, NetCDF, SBET, subtitles and more.
+    """Write a track as KML, GeoJSON, GPX, GeoPackage, NMEA, ROS 2 bag, NetCDF, SBET, soundings and more.
 
     Example: rovgraph export results --to kml --to geojson
     """
@@ -142,7 +143,7 @@ def export(
             table.add_row(each.name, each.title, f"rovgraph\\[{each.extra}]" if each.extra else "")
         shown.print(table)
         return
-    for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force, origin, surface):
+    for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force, origin, surface, cell):
         say(shown, f"written: {path}")
 
 

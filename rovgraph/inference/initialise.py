@@ -42,6 +42,7 @@ from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import SoundCorrection
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 

@@ -2,10 +2,11 @@
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
 v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
-Unix time, and ``lat, lon`` if the origin of n on Earth is known. TUM files hold ``time x y z qx qy qz qw`` in n, for
-tools such as ``evo_ape``.
+Unix time, ``lat, lon`` if the origin of n on Earth is known, and what else is known at its epochs. TUM files
+hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -255,6 +256,7 @@ class Trajectory:
         more: bool = False,
         origin: tuple[float, float] | None = None,
         unix: bool | None = None,
+        also: Mapping[str, Array] | None = None,
     ) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
@@ -264,6 +266,7 @@ class Trajectory:
         more : rows for the end of a file that has the same columns
         origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
         unix : whether there is a column ``unix_time``, empty for other times; None = if the time is Unix time
+        also : further columns, such as the bottom under the track, ndarray, shape (n,); NaN is an empty cell
         """
         rounded = {name: np.round(own, 12) + 0.0 for name, own in self.columns().items()}  # no -0
         known = {name: own for name, own in rounded.items() if not np.isnan(own).all()}
@@ -277,6 +280,7 @@ class Trajectory:
         if origin is not None:
             known["lat"], known["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
+        known |= {name: own for name, own in (also or {}).items() if not np.isnan(own).all()}
         write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
 
     def write_tum(self, path: Path | str) -> None:

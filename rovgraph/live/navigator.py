@@ -8,32 +8,36 @@ import math
 import time as host
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.bottom import Bottom, bottom_under
 from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
-from rovgraph.live.solution import BeaconPlace, Event, RangeCircle, ShipPose, Solution
-from rovgraph.log import Log, Measurement
-from rovgraph.model.calibration import LAYOUT, TABLE, beacon_names
+from rovgraph.live.solution import BeaconPlace, Event, RangeCircle, SensorHealth, ShipPose, Solution
+from rovgraph.log import Log, Measurement, Stream
+from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT, MOUNT, TABLE, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
+from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
 if TYPE_CHECKING:
     from rovgraph.inference.graph.isam2 import IncrementalEstimator
 
 ALTITUDE_S = 3.0  # longest age of an altitude
+PLACE_OF_RANGES = (*MOUNT, "dvl_lever_arm", "dvl_scale")  # calibration variables
 RANGE_S = 15.0  # longest age of an acoustic range that is shown
 BEACON_SD_M = 100.0  # beyond it a beacon is not shown
 TICK_S = 0.1  # between looks for sensors that have fallen silent
@@ -89,7 +93,9 @@ class Navigator:
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
-        self._altitude = (-np.inf, np.nan)  # its time, and what it was
+        self._sounded: Measurement | None = None  # newest ranges, or altitude
+        self._bottom: Bottom | None = None  # that these show, once a solution has placed them
+        self._beam_seen: dict[str, float] = {}  # when each was valid last [s]
         self._located = self.config.start.located  # where the fixes count from
 
     @property
@@ -222,15 +228,15 @@ class Navigator:
             latitude=latitude,
             longitude=longitude,
             calibration=self._calibration(engine, known),
-            sensors=self.health.of(self.faults.watches, self.time),
+            sensors=self._sensors(),
             events=self._take_events(),
             verdict=self.alarms.verdict,
             alarms=self.alarms.active,
             distance=self._travelled(t.p_n[0], t.p_sd[0]),
-            altitude=self._altitude[1] if self.time - self._altitude[0] < ALTITUDE_S else None,
             predicted_s=float(t.time[0]) - engine.snapshots[-1].time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
+            **self._below(engine, known, t),
             **self._acoustics(engine, known, t.p_n[0]),
         )
 
@@ -269,8 +275,8 @@ class Navigator:
         """Screen one measurement, of a sensor or of a person, and pass it to the filter."""
         if m.time > self.time:
             self.time = m.time
-        if m.sensor == "dvl_altitude":
-            self._altitude = m.time, float(m.values[0])
+        if m.sensor in (BEAMS, "dvl_altitude"):
+            self._sound(m)
         verdict = self.faults.accept(m) if by_hand else self.faults.look(m)
         if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # other sensors reveal an IMU outage
             self.faults.tick(self.time)
@@ -410,6 +416,48 @@ class Navigator:
             for name in engine.filter.unknowns.estimated
             for label, value, value_sd in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
         }
+
+    def _sound(self, m: Measurement) -> None:
+        """Note which beams are valid, and ranges for the next solution: an altitude where beams have none."""
+        ranges = m.sensor != BEAMS
+        if m.sensor == BEAMS:
+            beams = beams_of(m.values[None])
+            moving = beams.valid[0] & np.isfinite(beams.velocity[0])
+            self._beam_seen |= {BEAM_SENSORS[k]: m.time for k in np.array(beams.numbers)[moving].tolist()}
+            known = np.isfinite([*beams.range[0], *beams.distance[0]]).any()
+            ranges = bool(known) and beam_geometry(self.config.dvl) is not None
+        newest = self._sounded
+        old = newest is None or newest.sensor != BEAMS or m.time - newest.time > ALTITUDE_S
+        if ranges and (old or m.sensor == BEAMS):
+            self._sounded, self._bottom = m, None
+
+    def _sensors(self) -> dict[str, SensorHealth]:
+        """All sensors, and the single beams that the estimate uses."""
+        used = () if self.engine is None else self.engine.initial.instruments
+        seen = {sensor: self._beam_seen.get(sensor, -np.inf) for sensor in used if sensor in BEAM_SENSORS}
+        return self.health.of(self.faults.watches, self.time) | self.health.of_beams(seen, self.time)
+
+    def _below(self, engine: FixedLag, known: Gaussian, t: Trajectory) -> dict[str, float]:
+        """Altitude and depth of the bottom by the newest ranges."""
+        m = self._sounded
+        if m is None or not self.time - m.time < ALTITUDE_S:
+            return {}
+        if self._bottom is None:
+            beliefs = engine.filter.beliefs
+            constants = {
+                label: (float(value), beliefs[name].sd if beliefs[name].considered else 0.0)
+                for name in PLACE_OF_RANGES
+                for label, value in zip(TABLE[name].labels, known.c[LAYOUT[name]], strict=True)
+            }
+            stream = Stream(m.sensor, (), t.time, m.values[None], np.array([m.row]))
+            calibration = constants | self._calibration(engine, known)
+            self._bottom = bottom_under(t, {m.sensor: stream}, self.config, calibration)
+        if self._bottom is None:
+            return {}
+        moved = replace(t, time=self._bottom.time)
+        found = {name: float(values[0]) for name, values in self._bottom.under(moved).items()}
+        names = ("altitude", "altitude_sd", "bottom_depth", "bottom_depth_sd")
+        return {name: found[name] for name in names} if math.isfinite(found["altitude"]) else {}
 
     def _acoustics(self, engine: FixedLag, known: Gaussian, p_n: Array) -> dict[str, Any]:
         """Ship, beacons and the newest ranges, for the page."""

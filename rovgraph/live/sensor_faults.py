@@ -42,7 +42,6 @@ from rovgraph.live.solution import Event, SensorHealth
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_false_zero
 from rovgraph.log.streams import joined
-from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -476,9 +475,7 @@ class Health:
             self._gap_until = max(self._gap_until, time + 1.0)
 
     def of(self, watches: Mapping[str, Watch], time: float) -> dict[str, SensorHealth]:
-        """All sensors at a time; beams of a DVL have the watch of their pings."""
-        beams = [sensor for sensor in BEAM_SENSORS if sensor in self.used or sensor in self.rejected]
-        watches = {**watches, **{sensor: watches[BEAMS] for sensor in beams if BEAMS in watches}}
+        """All sensors at a time, but for single beams of a DVL."""
         return {
             sensor: SensorHealth(
                 "rejected" if sensor in self._out and watch.state == "ok" else watch.state,
@@ -489,6 +486,15 @@ class Health:
             )
             for sensor, watch in watches.items()
         }
+
+    def of_beams(self, seen: Mapping[str, float], time: float) -> dict[str, SensorHealth]:
+        """Single beams of the DVL; ``seen`` has when each was valid last [s]."""
+        found = {}
+        for sensor, last in seen.items():
+            lost = time - last if time - last > BEAM_LOST_S else 0.0
+            state = "no lock" if lost else "rejected" if sensor in self._out else "ok"
+            found[sensor] = SensorHealth(state, time - last, self.used[sensor], self.rejected[sensor], lost)
+        return found
 
     def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
         self.events.append(Event(time, sensor, kind, text))
@@ -501,6 +507,7 @@ def _failed(watch: Watch, time: float) -> float:
     return time - (watch.time if watch.state == "silent" else watch.entered)
 
 
+BEAM_LOST_S = 2.0  # without a valid velocity along it
 SENSOR = "dvl"
 REJECTIONS, WITHIN_S = 3, 20.0  # so many rejections within that time are no knock
 COHERENT_S = 25.0  # without rejections before

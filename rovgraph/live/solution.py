@@ -96,7 +96,8 @@ class Solution:
     events : since the last solution
     verdict, alarms : of the estimate now, and the alarms behind the verdict
     distance : travelled [m]
-    altitude : newest height over the bottom that the DVL reported [m], None if older than 3 s
+    altitude, altitude_sd : straight down to the bottom by the DVL's newest ranges [m], None if older than 3 s
+    bottom_depth, bottom_depth_sd : of the bottom there [m], None likewise
     predicted_s : time since the newest keyframe, bridged by the IMU alone [s]
     latency_s : from the arrival of the newest measurement to this solution [s], None in a replay
     update_s : duration of the newest update [s]
@@ -120,6 +121,9 @@ class Solution:
     alarms: tuple[Alarm, ...] = ()
     distance: float = 0.0
     altitude: float | None = None
+    altitude_sd: float | None = None
+    bottom_depth: float | None = None
+    bottom_depth_sd: float | None = None
     predicted_s: float = 0.0
     latency_s: float | None = None
     update_s: float = 0.0

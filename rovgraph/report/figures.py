@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError, kind_of
 from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
+from rovgraph.inference.bottom import Bottom, bottom_of
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.log import Log, Stream
+from rovgraph.log import Log
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.report.colours import PRIOR, REJECTED, UNUSED, USED
-from rovgraph.report.motion import Series, axis_limits, bottom, lower_end, motion, span, unwrapped, within
+from rovgraph.report.motion import Series, axis_limits, lower_end, motion, span, unwrapped, within
 from rovgraph.report.results import CHI2_99, ellipse_axes, history_labels, main_first
 from rovgraph.report.style import (
     WIDTH,
@@ -201,45 +202,41 @@ def _series(
         axes.set_ylim(*limits)
 
 
-def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
-    """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
+def draw_depth(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
+    """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured ranges."""
     clock = TimeAxis.of(estimates[0])
-    has_bottom = "dvl_altitude" in log
+    bottom = bottom_of(log, config, estimates[0])
+    has_bottom = bottom is not None
     figure = new_figure(4.8 if has_bottom else 3.6)
     panels: list[Axes] = list(figure.subplots(1 + has_bottom, 1, sharex=True, squeeze=False)[:, 0])
     panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if has_bottom else ""), loc="left")
-    _draw_depth(panels[0], estimates, log, clock)
-    if has_bottom:
-        _draw_altitude(panels[1], log, clock)
+    _draw_depth(panels[0], estimates, bottom, clock)
+    if bottom is not None:
+        _draw_altitude(panels[1], bottom, clock)
     clock.name_axis(panels[-1])
     figure.align_ylabels()
     legend_below(figure, panels)
     return figure
 
 
-def _draw_depth(axes: Axes, estimates: Sequence[Estimate], log: Log, clock: TimeAxis) -> None:
+def _draw_depth(axes: Axes, estimates: Sequence[Estimate], bottom: Bottom | None, clock: TimeAxis) -> None:
     """Depth, growing downwards, and the bottom where it is known."""
     more = []
-    if "dvl_altitude" in log:
-        stream, track = _altitudes(log), estimates[0].trajectory
-        below = bottom(track.time, track.p_n[:, 2], stream.time, stream["dvl_altitude"])
-        axes.plot(clock(stream.time), below, label="bottom", **BOTTOM)
-        more.append(span(stream.time, below, np.zeros_like(below), BAND))
+    if bottom is not None:
+        some = thin(len(bottom.time))
+        time, below = bottom.time[some], (bottom.place[:, 2] + bottom.plane[:, 0])[some]
+        axes.plot(clock(time), below, label="bottom", **BOTTOM)
+        more.append(span(time, below, np.zeros_like(below), BAND))
     _series(axes, clock, [(estimate, _motion(estimate.trajectory)["depth"]) for estimate in estimates], more)
     axes.yaxis.set_inverted(True)
     axes.set_ylabel("depth [m]")
 
 
-def _draw_altitude(axes: Axes, log: Log, clock: TimeAxis) -> None:
-    stream = _altitudes(log)
-    axes.plot(clock(stream.time), stream["dvl_altitude"], **BOTTOM)
+def _draw_altitude(axes: Axes, bottom: Bottom, clock: TimeAxis) -> None:
+    some = thin(len(bottom.time))
+    axes.plot(clock(bottom.time[some]), bottom.plane[some, 0], **BOTTOM)
     axes.set_ylabel("altitude [m]")
     axes.set_ylim(bottom=0.0)
-
-
-def _altitudes(log: Log) -> Stream:
-    stream = log["dvl_altitude"]
-    return stream.take(thin(len(stream)))
 
 
 def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
@@ -602,7 +599,7 @@ def draw_figures(
             "track": draw_track(estimates, log, config, reference),
             "velocity": draw_velocity(over_time),
             "attitude": draw_attitude(over_time, log, config),
-            "depth": draw_depth(over_time, log),
+            "depth": draw_depth(over_time, log, config),
             "residuals": draw_residuals(estimates[0]),
             "calibration": draw_calibration(over_time),
         }
@@ -643,17 +640,18 @@ class Plot:
         return axes
 
     def depth(self, axes: Axes | None = None, *estimates: str) -> Axes:
-        """Depth [m], growing downwards, and the bottom where the DVL measured an altitude."""
+        """Depth [m], growing downwards, and the bottom where the DVL measured ranges."""
         chosen, axes = self._chosen(estimates), _axes(axes)
-        _draw_depth(axes, chosen, self.log, TimeAxis.of(chosen[0]))
+        _draw_depth(axes, chosen, bottom_of(self.log, self.config, chosen[0]), TimeAxis.of(chosen[0]))
         return self._over_time(axes, chosen)
 
     def altitude(self, axes: Axes | None = None) -> Axes:
-        """Height over the bottom as the DVL measured it [m]."""
-        if "dvl_altitude" not in self.log:
-            raise InputError(f"{self.log.source}: no altitude to draw; the log has no dvl_altitude")
+        """Height over the bottom [m], by the ranges of the DVL's beams or its altitude."""
+        bottom = bottom_of(self.log, self.config, self.main)
+        if bottom is None:
+            raise InputError(f"{self.log.source}: no altitude to draw; the log has no dvl_altitude and no ranges")
         axes = _axes(axes)
-        _draw_altitude(axes, self.log, TimeAxis.of(self.main))
+        _draw_altitude(axes, bottom, TimeAxis.of(self.main))
         return self._over_time(axes, [self.main])
 
     def heading(self, axes: Axes | None = None, *estimates: str) -> Axes:

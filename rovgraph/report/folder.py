@@ -20,7 +20,7 @@ from rovgraph import compatibility
 from rovgraph._version import __version__
 from rovgraph.errors import InputError, warn
 
-SUMMARY, ACOUSTICS_FILE = "summary.json", "acoustics.csv"
+SUMMARY, ACOUSTICS_FILE, SOUNDINGS_FILE = "summary.json", "acoustics.csv", "soundings.csv"
 STAMP = {  # in every summary: the folder is ours
     "program": "rovgraph",
     "version": __version__,

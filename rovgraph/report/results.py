@@ -19,6 +19,7 @@ import pandas as pd
 from rovgraph.diagnosis.alarm import Alarm, verdict_of
 from rovgraph.diagnosis.check.clocks import timing
 from rovgraph.geometry import Array
+from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
@@ -27,10 +28,10 @@ from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config
-from rovgraph.report.folder import ACOUSTICS_FILE, STAMP, SUMMARY
+from rovgraph.report.folder import ACOUSTICS_FILE, SOUNDINGS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
-from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.dvl_beam import BEAMS, error_velocity
 
 LIBRARIES = ("numpy", "scipy", "pandas", "numba", "gtsam")
 NEAREST_S = 1.0  # longest time between an altitude and its ping
@@ -204,7 +205,9 @@ def write_results(
     """
     estimates = main_first(estimates)
     for estimate in estimates:
-        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv", origin=log.origin)
+        bottom = bottom_of(log, config, estimate)
+        under = None if bottom is None else bottom.under(estimate.trajectory)
+        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv", origin=log.origin, also=under)
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}{TUM}")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
@@ -226,12 +229,18 @@ def write_results(
 
 
 def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen: Sequence[FrozenStretch]) -> None:
-    """Write dvl.csv, where there is a DVL, dvl_beams.csv, where its beams are known, and left_out.csv."""
+    """Write left_out.csv, and of a DVL dvl.csv, dvl_beams.csv and soundings.csv, as far as each is known."""
     pings = dvl_frame(log, frozen)
     if pings is not None:
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
     if BEAMS in log:
-        write_csv(beams_frame(log[BEAMS]), folder / BEAMS_FILE, decimals={"time": 4})
+        error = error_velocity(log[BEAMS].data, config.dvl)
+        frame = beams_frame(log[BEAMS])
+        frame = frame if np.isnan(error).all() else frame.assign(error_velocity=error)
+        write_csv(frame, folder / BEAMS_FILE, decimals={"time": 4})
+    bottom = bottom_of(log, config, main)
+    if bottom is not None:
+        write_csv(bottom.soundings, folder / SOUNDINGS_FILE, decimals={"time": 4})
     left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []), frozen)
     write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 

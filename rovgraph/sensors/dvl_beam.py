@@ -204,6 +204,21 @@ def velocity_by_beams(directions: Array, velocity: Array, valid: NDArray[np.bool
     return out, error
 
 
+def error_velocity(data: Array, dvl: Dvl) -> Array:
+    """What the valid beams of n pings disagree by, as `velocity_by_beams` has it, shape (n,) [m/s].
+
+    Parameters
+    ----------
+    data : as of `beams_of`
+    """
+    geometry = beam_geometry(dvl)
+    if geometry is None:
+        return np.full(len(data), np.nan)
+    beams = beams_of(data, geometry.numbers)
+    moving = beams.valid & np.isfinite(beams.velocity)
+    return velocity_by_beams(geometry.directions, beams.velocity, moving)[1]
+
+
 class Refusals(NamedTuple):
     """What has been seen of the pings that a DVL refuses.
 

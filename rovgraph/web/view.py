@@ -17,7 +17,7 @@ from rovgraph.live.marks import Marks
 from rovgraph.live.outputs.json_lines import as_dict
 from rovgraph.live.solution import BeaconPlace, RangeCircle, ShipPose, Solution
 from rovgraph.log.units import shown
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import BEAM_SENSORS, TABLE
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
 COLUMNS = ("time", "north", "east", "down", "sd")  # of a point; sd is that of the longer axis of its ellipse
@@ -220,7 +220,10 @@ class View:
         if not heading <= self.limits.heading_sd_deg:
             limit = self.limits.heading_sd_deg
             found.append({"kind": "heading", "text": f"heading sd {heading:.1f}°, limit {limit:g}°"})
+        by_beams = any(s.sensors[name].state == "ok" for name in BEAM_SENSORS if name in s.sensors)
         for name, health in s.sensors.items():
+            if name in BEAM_SENSORS or (by_beams and name == "dvl" and health.state == "no lock"):
+                continue  # the other beams carry the track
             if name in HEADING_STREAMS and health.state == "rejected":
                 found.append({"kind": "heading", "text": f"{name} disagrees with the heading"})
             elif health.state in ("silent", "no lock"):

@@ -37,6 +37,9 @@ def as_dict(solution: Solution) -> dict[str, Any]:
         known |= zip(names, map(_number, values.tolist()), strict=True)
     for names, sds in ((POSITION, s.position_sd), (ATTITUDE, s.rpy_sd), (VELOCITY, s.velocity_sd)):
         known |= zip([f"{name}_sd" for name in names], map(_number, sds.tolist()), strict=True)
+    if s.altitude is not None:
+        below = {name: getattr(s, name) for name in ("altitude", "altitude_sd", "bottom_depth", "bottom_depth_sd")}
+        known |= {name: _number(value) for name, value in below.items() if value is not None}
     return known | {
         "cov_north_east": _number(s.cov_north_east),
         "latitude": _number(s.latitude, decimals=9),

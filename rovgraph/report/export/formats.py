@@ -17,7 +17,7 @@ from pathlib import Path
 from rovgraph.errors import InputError, in_one_line, warn
 from rovgraph.report.export.track import Track, require_place, require_utc
 
-OWN = ("maps", "trajectories", "sentences", "ros2")  # modules of this package, each with `FORMATS`
+OWN = ("maps", "soundings", "trajectories", "sentences", "ros2")  # modules of this package, each with `FORMATS`
 GROUP = "rovgraph.exports"
 
 
@@ -28,11 +28,13 @@ class ExportOptions:
     Attributes
     ----------
     rate : of points that a format has at a rate [Hz]; None = the format's own
-    crs : coordinates of a GIS layer, such as "EPSG:32633" or "utm"; None = latitude and longitude
+    crs : coordinates of a GIS layer or of soundings, such as "EPSG:32633" or "utm"; None = the format's own
+    cell : width of the cells of a grid [m]; None = the format's own
     """
 
     rate: float | None = None
     crs: str | None = None
+    cell: float | None = None
 
     def rate_or(self, usual: float) -> float:
         """The rate asked for, or a format's own [Hz]."""

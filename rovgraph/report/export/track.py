@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.trajectory import Trajectory, read_trajectory
-from rovgraph.report.folder import ACOUSTICS_FILE, beacon_names_of
+from rovgraph.report.folder import ACOUSTICS_FILE, SOUNDINGS_FILE, beacon_names_of
 
 CHI2_95 = 5.991  # of two degrees of freedom
 ESTIMATES = ("smoothed", "filtered", "dead_reckoning")
@@ -64,6 +64,7 @@ class Track:
     fixes : None where the dive has none
     surface : height of the water's surface above sea level [m]
     acoustics : None where the dive has no acoustic system
+    soundings : rows of soundings.csv (docs/results.md), None where the DVL measured no ranges
     """
 
     name: str
@@ -73,6 +74,7 @@ class Track:
     fixes: Fixes | None = None
     surface: float = 0.0
     acoustics: ShipAndBeacons | None = None
+    soundings: pd.DataFrame | None = field(default=None, compare=False)
 
     @cached_property
     def lat_lon(self) -> tuple[Array, Array]:
@@ -153,7 +155,10 @@ class Track:
         if not np.isfinite(seconds):
             raise InputError(f"unix_offset: {seconds:g} is no number of seconds")
         fixes = None if self.fixes is None else replace(self.fixes, time=self.fixes.time + seconds)
-        return replace(self, trajectory=replace(self.trajectory, time=self.trajectory.time + seconds), fixes=fixes)
+        trajectory = replace(self.trajectory, time=self.trajectory.time + seconds)
+        found = self.soundings
+        soundings = None if found is None else found.assign(time=found["time"] + seconds)
+        return replace(self, trajectory=trajectory, fixes=fixes, soundings=soundings)
 
     def at_rate(self, rate: float | None) -> "Track":
         """At whole multiples of a period, interpolated; None = at every keyframe.
@@ -249,7 +254,10 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
     origin = None if place is None else (float(place["lat_deg"]), float(place["lon_deg"]))
     trajectory = read_trajectory(folder / f"trajectory_{chosen}.csv")
     name = str(summary.get("name") or folder.name)
-    return Track(name, chosen, trajectory, origin, _read_fixes(folder), acoustics=_read_acoustics(folder, summary))
+    fixes, acoustics = _read_fixes(folder), _read_acoustics(folder, summary)
+    path = folder / SOUNDINGS_FILE  # of the main estimate, which is the first
+    soundings = pd.read_csv(path) if path.is_file() and chosen == kinds[0] else None
+    return Track(name, chosen, trajectory, origin, fixes, acoustics=acoustics, soundings=soundings)
 
 
 def _read_fixes(folder: Path) -> Fixes | None:

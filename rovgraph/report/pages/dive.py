@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.report.colours import SERIES
+from rovgraph.report.colours import BOTTOM, SERIES
 from rovgraph.report.motion import Series, axis_limits, bottom, lower_end, motion, span, unwrapped
 from rovgraph.report.pages.page import Item, Panel, Section, Trace, broken, extremes, line, packed
 from rovgraph.report.pages.source import DiveSource
 from rovgraph.report.pages.uncertainty import sd_panels
 
-BOTTOM = "#8C6D46"
 STRETCHES = 500  # of a series; two panels stand side by side
 SHOWN = (
     ("Depth", "depth [m]", ("depth",)),
@@ -46,11 +45,9 @@ def _panel(source: DiveSource, title: str, label: str, shown: Sequence[Series]) 
         drawn.append(_band(source, one, colour))
         spans.append(span(time, one.value, one.sd, 1.0))
     if shown[0].name == "depth":
-        below = _bottom(source)
+        below = over_bottom(source, "bottom_depth")
         if below is not None:
-            ping, depth = broken(*below)
-            some = extremes(depth, stretches=STRETCHES)
-            drawn.append(line("bottom", source.clock(ping[some]), depth[some], BOTTOM))
+            drawn.append(bottom_line(source, below, "bottom"))
             spans.append(span(below[0], below[1], np.zeros_like(below[1]), 0.0))
     limits = axis_limits(spans)
     if limits is not None and shown[0].name == "speed":
@@ -67,29 +64,34 @@ def _band(source: DiveSource, one: Series, colour: str) -> Trace:
     return line(one.name, source.clock(time), value, colour, **band)
 
 
-def _pings(source: DiveSource) -> tuple[Array, Array] | None:
-    """Times and altitudes of pings that have one."""
-    pings = source.pings
-    if pings is None:
+def over_bottom(source: DiveSource, name: str) -> tuple[Array, Array, Array] | None:
+    """``altitude`` or ``bottom_depth`` under the vehicle: times, values, sds; of older folders by pings."""
+    track, pings = source.main, source.pings
+    if name in track.columns:
+        time, value, sd = track["time"], track[name], track[f"{name}_sd"]
+    elif pings is not None:
+        time, value = pings["time"].to_numpy(float), pings["altitude"].to_numpy(float)
+        value = value if name == "altitude" else bottom(track["time"], track["down"], time, value)
+        sd = np.full(len(time), np.nan)
+    else:
         return None
-    time, altitude = pings["time"].to_numpy(float), pings["altitude"].to_numpy(float)
-    known = np.isfinite(altitude)
-    return (time[known], altitude[known]) if known.any() else None
+    known = np.isfinite(value)
+    return (time[known], value[known], sd[known]) if known.any() else None
 
 
-def _bottom(source: DiveSource) -> tuple[Array, Array] | None:
-    """Times of pings and the depth of the bottom under them."""
-    pings = _pings(source)
-    return None if pings is None else (pings[0], bottom(source.main["time"], source.main["down"], *pings))
+def bottom_line(source: DiveSource, found: tuple[Array, Array, Array], label: str) -> Trace:
+    """What `over_bottom` found as a line with its band, broken where nothing was measured."""
+    time, value = broken(*found[:2])
+    sd = broken(found[0], found[2])[1]
+    some = extremes(value, stretches=STRETCHES)
+    look = {"sd": packed(sd[some]), "band": 1} if np.isfinite(sd).any() else {}
+    return line(label, source.clock(time[some]), value[some], BOTTOM, **look)
 
 
 def _altitude(source: DiveSource) -> list[Item]:
-    pings = _pings(source)
-    if pings is None:
+    found = over_bottom(source, "altitude")
+    if found is None:
         return []
-    time, altitude = broken(*pings)
-    some = extremes(altitude, stretches=STRETCHES)
-    limits = axis_limits([(0.0, 0.0), span(pings[0], pings[1], np.zeros_like(pings[1]), 0.0)])
-    drawn = [line("altitude", source.clock(time[some]), altitude[some], BOTTOM)]
-    labels = (source.clock.label, "altitude [m]")
+    limits = axis_limits([(0.0, 0.0), span(*found, 1.0)])
+    drawn, labels = [bottom_line(source, found, "altitude")], (source.clock.label, "altitude [m]")
     return [Panel("Altitude over the bottom", *labels, drawn, wide=False, limits=limits)]

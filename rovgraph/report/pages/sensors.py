@@ -11,8 +11,10 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.geometry import Array
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import BEAM_SENSORS, TABLE
 from rovgraph.report.colours import REJECTED, SERIES
+from rovgraph.report.motion import axis_limits
+from rovgraph.report.pages.dive import bottom_line, over_bottom
 from rovgraph.report.pages.page import (
     Item,
     Missing,
@@ -30,7 +32,7 @@ from rovgraph.report.pages.page import (
     spread,
 )
 from rovgraph.report.pages.source import DiveSource, DiveTime
-from rovgraph.report.units import words
+from rovgraph.report.units import percent, words
 from rovgraph.sensors.dvl_beam import Beams, beams_of
 
 BINS = 240  # of the dive; on a narrow screen a bin is hardly wider than a pixel
@@ -118,11 +120,12 @@ SHADE = "#B35900"
 
 
 def dvl_section(source: DiveSource) -> Section:
-    """Lock, altitude, beams, figure of merit, silences and velocities."""
+    """Lock, beams, figure of merit, silences, velocities, and the bottom."""
     title, clock, pings = "DVL", source.clock, source.pings
     if pings is None:
         why = "the folder has no dvl.csv: no DVL, or an older version"
-        return Section("dvl", title, (), [Missing("Pings", why)], finding="There are no pings to show.")
+        items = [Missing("Pings", why)] if source.beams is None else _by_beams(source, [])
+        return Section("dvl", title, (), items, finding="There are no velocities to show.")
     time, lock = pings["time"].to_numpy(float), pings["lock"].to_numpy(float)
     items: list[Item] = []
     spans = [(*clock(np.array(s)).tolist(), SHADE) for s in source.silences]
@@ -130,14 +133,83 @@ def dvl_section(source: DiveSource) -> Section:
     seen = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom" if len(lock) else "There is no ping"
     note = f"{seen}; one that repeats the ping before it saw nothing. Shaded: silences."
     items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans, ticks=(0.0, 1.0)))
-    items += beam_items(source, spans)
+    items += _by_beams(source, spans)
     items.append(_silences(time[lock == 1]))
     items += _merit(source, pings)
     items += _velocities(source, spans)
+    items += _profile(source)
     gap = max((end - begin for begin, end in source.silences), default=0.0)
     finding = f"{seen}" + (f"; the longest silence took {gap:.3g} s." if gap else "; it never fell silent.")
-    well = not _sensors_with(source, "alarms", ("dvl",)) if len(lock) else None
+    well = not _sensors_with(source, "alarms", ("dvl", *BEAM_SENSORS)) if len(lock) else None
     return Section("dvl", title, (), items, finding=finding, well=well)
+
+
+def _by_beams(source: DiveSource, spans: Sequence[tuple[float, float, str]]) -> list[Item]:
+    """Every beam by itself: how its pings fitted, how many were valid, its range; and what the beams disagree by."""
+    items = [*_beam_table(source), *beam_items(source, spans)]
+    error = source.error_velocity
+    if error is not None and len(error):
+        time, size = error["time"].to_numpy(float), error["error_velocity"].to_numpy(float)
+        some = cloud(size)
+        drawn = [points("error velocity", source.clock(time[some]), size[some], BLUE, size=3)]
+        note = "What four beams or more disagree by, as noisy as one beam: about its noise where all is well. "
+        note += f"Median {np.median(size):.2g} m/s."
+        limits = (0.0, 1.2 * max(float(np.percentile(size, 99.0)), 1e-3))
+        labels = (source.clock.label, "error velocity [m/s]")
+        items.append(Panel("Error velocity", *labels, drawn, note=note, spans=spans, limits=limits))
+    return items
+
+
+def _beam_table(source: DiveSource) -> list[Item]:
+    """Used and rejected pings of each beam, and its noise."""
+    if source.residuals is None:
+        return []
+    rows = []
+    for sensor in BEAM_SENSORS:
+        own = source.residuals[source.residuals["sensor"] == sensor]
+        used = own[own["weight"] > 0]
+        if own.empty:
+            continue
+        found = _rms(used["innovation"]) if len(used) else np.nan
+        stated = _rms(used["sd"]) if len(used) and "sd" in used else np.nan
+        rejected = len(own) - len(used)
+        share = f"{rejected} ({percent(rejected / len(own))})" if rejected else "0"
+        rows.append((sensor.removeprefix("dvl_beam_"), f"{len(used)}", share, f"{found:.2g}", f"{stated:.2g}"))
+    head = ("beam", "pings used", "rejected", "noise found [m/s]", "stated [m/s]")
+    note = "Noise found: rms of measured less estimated along the beam, of the pings used."
+    return [PageTable("Velocities along the beams", head, rows, note=note)] if rows else []
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt(np.mean(np.square(values.to_numpy(float)))))
+
+
+def _profile(source: DiveSource) -> list[Item]:
+    """The vehicle over the bottom, with what each range met."""
+    track, found = source.main, source.soundings
+    if found is None or found.empty:
+        return []
+    drawn: list[Trace] = []
+    beams = [*found.loc[found["used"] == 1, "beam"].unique()]
+    for beam, colour in zip(sorted(beams), SERIES, strict=False):
+        own = found[(found["beam"] == beam) & (found["used"] == 1)]
+        own = own.iloc[spread(len(own), POINTS // max(len(beams), 1))]
+        name = f"beam {beam}" if beam >= 0 else "altitude of the DVL"
+        drawn.append(points(name, source.clock(own["time"].to_numpy(float)), own["depth"], colour, size=2))
+    spikes = found[found["used"] == 0]
+    if len(spikes):
+        when, some = source.clock(spikes["time"].to_numpy(float)), spread(len(spikes), POINTS)
+        drawn.append(points(f"left out ({len(spikes)})", when[some], spikes["depth"].iloc[some], REJECTED, size=4))
+    below = over_bottom(source, "bottom_depth")
+    if below is not None:
+        drawn.append(bottom_line(source, below, "bottom under the vehicle"))
+    some = extremes(track["down"])
+    drawn.append(line("vehicle", source.clock(track["time"][some]), track["down"][some], DARK))
+    note = "The bottom straight under the vehicle by a plane through the ranges of each ping, with one sd to each side."
+    labels = (source.clock.label, "depth [m]")
+    shown = (found.loc[found["used"] == 1, "depth"].to_numpy(float), track["down"])
+    limits = axis_limits([(float(np.nanmin(one)), float(np.nanmax(one))) for one in shown if np.isfinite(one).any()])
+    return [Panel("Bottom under the track", *labels, drawn, note=note, down=True, limits=limits)]
 
 
 def _sensors_with(source: DiveSource, list_of: str, sensors: Sequence[str], kinds: Sequence[str] = ()) -> list[str]:
@@ -193,15 +265,17 @@ def _velocities(source: DiveSource, spans: list[tuple[float, float, str]]) -> li
     if rows is None or not {"measured", "predicted"} <= set(rows.columns):
         return [Missing("Velocities", "residuals.csv is missing or incomplete")]
     items: list[Item] = []
-    for component, own in rows[rows["sensor"] == "dvl"].groupby("component", sort=False):
+    of_dvl = rows[rows["sensor"].isin(["dvl", *BEAM_SENSORS])]
+    for (sensor, component), own in of_dvl.groupby(["sensor", "component"], sort=False):
+        beam = str(sensor).removeprefix("dvl_beam_")
         time, measured = own["time"].to_numpy(float), own["measured"].to_numpy(float)
         some = cloud(measured)
         drawn = [
             points("measured", source.clock(time[some]), measured[some], "#7A7A7A", size=3),
             _over_time(source, source.main.name, time, own["predicted"].to_numpy(float)),
         ]
-        title = f"Velocity along the DVL's {component} axis"
-        items.append(Panel(title, source.clock.label, f"v_{component} [m/s]", drawn, spans=spans))
+        along, symbol = (f"the DVL's {component} axis", f"v_{component}") if sensor == "dvl" else (f"beam {beam}", "v")
+        items.append(Panel(f"Velocity along {along}", source.clock.label, f"{symbol} [m/s]", drawn, spans=spans))
     return items
 
 

@@ -24,8 +24,10 @@ from rovgraph.geometry import Array
 from rovgraph.log import Stream
 from rovgraph.log.beams import beams_of_table
 from rovgraph.log.tables import read_table
+from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import config_or_defaults
-from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.problem.beams import ONE_PING_S, nearest
+from rovgraph.report.folder import SOUNDINGS_FILE, STAMP, SUMMARY
 from rovgraph.report.pages.page import Image, Item, Missing, PageTable, Section, Text, render
 from rovgraph.report.results import BEAMS_FILE, CHI2_99
 
@@ -268,7 +270,16 @@ class DiveSource(ResultsSource):
 
     @cached_property
     def pings(self) -> pd.DataFrame | None:
-        return self.frame("dvl.csv", "time", "lock", "altitude", "figure_of_merit", "row")
+        """Rows of dvl.csv; one whose beams were used saw the bottom, whatever the instrument made of them."""
+        pings = self.frame("dvl.csv", "time", "lock", "altitude", "figure_of_merit", "row")
+        if pings is not None and self.residuals is not None:
+            by_beams = self.residuals["sensor"].isin(BEAM_SENSORS) & (self.residuals["weight"] > 0)
+            used = np.unique(self.residuals.loc[by_beams, "time"].to_numpy(float))
+            if len(used):
+                time = pings["time"].to_numpy(float)
+                near = np.abs(used[nearest(used, time)] - time) < ONE_PING_S
+                pings["lock"] = np.maximum(pings["lock"], near)
+        return pings
 
     @cached_property
     def beams(self) -> Stream | None:
@@ -280,6 +291,17 @@ class DiveSource(ResultsSource):
         """
         path = self.folder / BEAMS_FILE
         return beams_of_table(read_table(path), config_or_defaults(None)) if path.is_file() else None
+
+    @cached_property
+    def error_velocity(self) -> pd.DataFrame | None:
+        """Times of pings and what their beams disagree by; None where the folder does not have it."""
+        table = self.frame(BEAMS_FILE)
+        known = table is not None and {"time", "error_velocity"} <= set(table.columns)
+        return table[["time", "error_velocity"]].dropna() if table is not None and known else None
+
+    @cached_property
+    def soundings(self) -> pd.DataFrame | None:
+        return self.frame(SOUNDINGS_FILE, "time", "beam", "north", "east", "depth", "used")
 
     @cached_property
     def silences(self) -> list[tuple[float, float]]:

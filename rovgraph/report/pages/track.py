@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from pymap3d.rcurve import meridian, transverse
 
 from rovgraph.geometry import Array
-from rovgraph.report.colours import ESTIMATES, REJECTED, USED
+from rovgraph.report.colours import BOTTOM, ESTIMATES, REJECTED, USED
 from rovgraph.report.pages.acoustics import acoustic_traces
 from rovgraph.report.pages.page import Missing, Panel, Trace, extremes, line, packed, points, spread
 from rovgraph.report.pages.source import KINDS, DiveSource, PageTrack
 
 ELLIPSES, ELLIPSE = 24, "#8A8A9A"
+SOUNDINGS = 1500  # that are drawn
 SPACED = np.linspace(0.0, 2 * np.pi, 41)
 SILENT, MARK = "#B35900", "#6A3D9A"
 # of the sd from low to high, dark to light: readable for the colour-blind and in grey (viridis, its pale end left out)
@@ -33,6 +34,7 @@ def track_chart(source: DiveSource) -> Panel | Missing:
         *_ellipses(source.main),
         *_fixes(source.residuals, source),
         *acoustic_traces(source),
+        *_soundings(source),
         *_silent(source),
         *coloured,
         *_ends(source),
@@ -173,6 +175,19 @@ def _fixes(rows: pd.DataFrame | None, source: DiveSource) -> list[Trace]:
             look = {"size": 6, "symbol": symbol, "t": packed(time[some])}
             drawn.append(points(f"{name} ({int(mask.sum())})", east[some], north[some], colour, **look))
     return drawn
+
+
+def _soundings(source: DiveSource) -> list[Trace]:
+    """Where ranges met the bottom; shown on demand."""
+    found = source.soundings
+    if found is None or found.empty:
+        return []
+    used = found[found["used"] == 1]
+    few = used.iloc[spread(len(used), SOUNDINGS)]
+    text = [f"{depth:.1f} m" for depth in few["depth"]]
+    look: dict[str, Any] = {"visible": "legendonly", "text": text, "hoverinfo": "text"}
+    when = packed(source.clock(few["time"].to_numpy(float)))
+    return [points(f"soundings ({len(used)})", few["east"], few["north"], BOTTOM, size=3, t=when, **look)]
 
 
 def _ellipses(track: PageTrack) -> list[Trace]:

@@ -68,7 +68,8 @@ export class Gauges {
     rose(heading.lastChild, s.yaw, s.yaw_sd, away ? home : null);
     this.gauge("gauges", "home", `${metres(far)} m\n${away ? bearing(home) : "–"}`, this.resumed ? "to where it resumed" : "home, to the start");
     this.gauge("gauges", "speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, `speed, ${s.speed === null ? "–" : (s.speed / KNOT).toFixed(1)} kn`);
-    if (s.altitude !== null || this.gauges.has("altitude")) this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
+    if (s.altitude !== null || this.gauges.has("altitude")) this.gauge("gauges", "altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, s.altitude_sd == null ? "altitude" : `altitude, sd ${spread(s.altitude_sd)} m`);
+    if (s.bottom_depth != null || this.gauges.has("bottom")) this.gauge("gauges", "bottom", `${metres(s.bottom_depth)} m`, s.bottom_depth == null ? "depth of the bottom" : `depth of the bottom, sd ${spread(s.bottom_depth_sd)} m`);
     this.bottom.add(s.time, s.down, s.altitude);
     const bed = this.bottom.points;
     const dashed = bed.some((point) => point[1] !== null) ? "; dashed: bottom" : "";
@@ -84,7 +85,10 @@ export class Gauges {
 
   lock(s) {
     const state = s.sensors.dvl?.state;
-    if (state === undefined) this.gauge("status", "lock", "–", "no DVL");
+    const beams = Object.entries(s.sensors).filter(([name]) => /^dvl_beam_[0-9]$/.test(name)).map(([, beam]) => beam.state);
+    const good = beams.filter((beam) => beam === "ok").length;
+    if (good) this.gauge("status", "lock", `${good} of ${beams.length}`, "beams of the DVL used", good > 2 ? "good" : "warn");
+    else if (state === undefined) this.gauge("status", "lock", "–", "no DVL");
     else if (state === "ok") this.gauge("status", "lock", "locked", "bottom lock", "good");
     else if (state === "rejected") this.gauge("status", "lock", "rejected", "DVL contradicts the estimate", "warn");
     else this.gauge("status", "lock", state, `DVL, for ${duration(s.lock_lost_s)}`, "bad");
