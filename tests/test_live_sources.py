@@ -518,7 +518,9 @@ def test_a_velocity_relative_to_the_water_is_no_bottom_track(heard):
 
 def test_a_report_without_bottom_lock_is_a_lost_ping_whatever_else_it_says(heard):
     data = report(velocity_valid=False, vx=0, vy=0, vz=0, altitude=-1, fom=2.7, status=1)
-    _, reading = only(decoded(waterlinked("w", heard), data))
+    (message,) = decoded(waterlinked("w", heard), data)
+    reading, beams = message.readings
+    assert beams.sensor == "dvl_beams"
     np.testing.assert_array_equal(reading.values, [np.nan, np.nan, np.nan, 0.0, np.nan])
     assert heard.kinds == {"status": 1}
 

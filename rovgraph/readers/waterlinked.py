@@ -25,7 +25,7 @@ from rovgraph.geometry import Array
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import Refused, json_number, json_object, shown
-from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS
+from rovgraph.sensors.dvl_beam import BEAMS, NUMBERS, QUANTITIES
 
 VELOCITIES = ("velocity", "velocity_water")
 FORMATS = ("json_v1", "json_v2", "json_v3")  # minor versions, as json_v3.2, only add to them
@@ -92,6 +92,20 @@ def velocity_report(row: dict[str, Any]) -> VelocityReport | None:
         _time(row, "time_of_transmission"),
         bool(row.get("status")),
     )
+
+
+def beam_cells(row: dict[str, Any]) -> dict[str, float]:
+    """What the beams of a report of bottom track measured, by the columns of a log; NaN = no number."""
+    beams = row.get("transducers")
+    if not isinstance(beams, list) or row.get("type") == "velocity_water" or row.get("tracking_mode") == "water":
+        return {}
+    known = [beam for beam in beams if isinstance(beam, dict) and _number(beam.get("id")) in NUMBERS]
+    return {
+        f"dvl_beam_{quantity}_{int(_number(beam['id']))}": _number(beam.get(name))
+        for beam in known
+        for name, quantity in _BEAM.items()
+        if quantity in QUANTITIES
+    }
 
 
 def _check(row: dict[str, Any]) -> None:

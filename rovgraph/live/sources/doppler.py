@@ -18,7 +18,7 @@ from rovgraph.readers.pd6 import Pd6Sentences
 from rovgraph.readers.recording import Channel
 from rovgraph.readers.records import Refused, json_object, shown
 from rovgraph.readers.trdi import channels_of
-from rovgraph.readers.waterlinked import STAMPED, VELOCITIES, VelocityReport, velocity_report
+from rovgraph.readers.waterlinked import STAMPED, VELOCITIES, VelocityReport, beam_cells, velocity_report
 
 PENDING = 1 << 14  # bytes that may be the beginning of a record; no Nucleus sends longer ones
 PASSWORD = b"enter password"
@@ -133,8 +133,8 @@ def report_message(row: dict[str, Any], url: str, arrival: float, notify: Notify
         return None
     if report.fault:
         notify("status", "the DVL reports a fault, such as being too hot; its velocities are used as long as valid")
-    readings = _readings(report)
-    return Message(url, arrival, report.validity, readings, latency=_latency(report)) if readings else None
+    found = (*_readings(report), *readings(beam_cells(row)))
+    return Message(url, arrival, report.validity, found, latency=_latency(report)) if found else None
 
 
 def _latency(report: VelocityReport) -> float | None:
