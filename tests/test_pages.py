@@ -55,7 +55,7 @@ def with_beams(log):
     columns = {f"valid_{k + 1}": valid[:, k] for k in range(4)} | {
         f"range_{k + 1}": 2.0 + k + valid[:, k] for k in range(4)
     }
-    return log.with_beams(usable_beams({"time": pings.time, **columns}))
+    return log.with_beams(usable_beams({"time": pings.time, **columns}, Config(), "beams"))
 
 
 @pytest.fixture(scope="session")

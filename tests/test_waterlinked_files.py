@@ -12,9 +12,11 @@ from wire import report
 
 from rovgraph.errors import InputError
 from rovgraph.log import Log
+from rovgraph.model.config import parse_config
 from rovgraph.readers.formats import recognise
 from rovgraph.readers.recording import Recording
 from rovgraph.readers.waterlinked import velocity_report
+from rovgraph.sensors.dvl_beam import beam_geometry, velocity_by_beams
 
 START = 1_638_191_471.0
 
@@ -189,3 +191,18 @@ def test_changed_bytes_raise_nothing_but_a_refusal(base, changes, tmp_path_facto
     for place, new in changes:
         data[place % len(data) : place % len(data) + 3] = new
     check_refused_or_whole(read, bytes(data), tmp_path_factory.getbasetemp())
+
+
+def test_the_makers_example_without_a_type_gives_its_velocity_by_its_beams(tmp_path):
+    """The protocol's json_v1: its velocities along four beams, and the velocity that it prints."""
+    along, printed = (-0.002349231, -0.003452149, 0.001837982, 0.002901435), (0.009757, 0.002016, -0.000286)
+    beams = [{"id": k, "velocity": b, "distance": 2.04, "beam_valid": True} for k, b in enumerate(along)]
+    one = dict(zip(("vx", "vy", "vz"), printed, strict=True)) | {"time": 106.4, "fom": 1e-4, "altitude": 1.871}
+    row = one | {"transducers": beams, "velocity_valid": True, "status": 0, "format": "json_v1"}
+    recording = read(5 * (json.dumps(row).encode() + b"\r\n"), tmp_path)
+    table = recording.tables["dvl_beams"]
+    found = np.array([[table[f"velocity_{k}"][0] for k in range(4)]])
+    geometry = beam_geometry(parse_config("dvl: {preset: waterlinked-a50}").dvl)
+    velocity, _ = velocity_by_beams(geometry.directions, found, np.isfinite(found))
+    np.testing.assert_allclose(velocity[0], [0.00974, 0.00200, -0.00029], rtol=0.0, atol=6e-6)
+    np.testing.assert_allclose(velocity[0], printed, rtol=0.0, atol=2e-5)
