@@ -357,7 +357,8 @@ def test_bad_names_and_rates_and_files_that_are_there_are_refused(tmp_path):
 
 def test_an_estimate_without_sds_is_exported_all_the_same(tmp_path):
     t = circle()
-    bare = Track("bare", "dead_reckoning", Trajectory.certain(t.time, t.p_n, t.R_nb, t.v_n), ORIGIN)
+    met = pd.DataFrame({"time": t.time[:1], "beam": 1, "north": 0.0, "east": 0.0, "depth": 9.0, "used": 1})
+    bare = Track("bare", "dead_reckoning", Trajectory.certain(t.time, t.p_n, t.R_nb, t.v_n), ORIGIN, soundings=met)
     for name in export_formats():
         written(name, tmp_path / name, of=bare)
     features = json.loads((tmp_path / "geojson" / "track_dead_reckoning.geojson").read_text(encoding="utf-8"))

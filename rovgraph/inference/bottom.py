@@ -137,7 +137,7 @@ class _Ranges:
     def R_bs(self) -> Array:
         if not all(name in self._known for name in MOUNT):
             return mount_matrix(self._config.dvl.mount_rpy_deg)
-        return matrix_from_rpy(np.array([[self.value(name) for name in MOUNT]]))[0]
+        return matrix_from_rpy(np.array([self.value(name) for name in MOUNT]))
 
     @property
     def arm_b(self) -> Array:

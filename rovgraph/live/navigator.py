@@ -437,7 +437,7 @@ class Navigator:
         seen = {sensor: self._beam_seen.get(sensor, -np.inf) for sensor in used if sensor in BEAM_SENSORS}
         return self.health.of(self.faults.watches, self.time) | self.health.of_beams(seen, self.time)
 
-    def _below(self, engine: FixedLag, known: Gaussian, t: Trajectory) -> dict[str, float]:
+    def _below(self, engine: FixedLag, known: Gaussian, t: Trajectory) -> dict[str, Any]:
         """Altitude and depth of the bottom by the newest ranges."""
         m = self._sounded
         if m is None or not self.time - m.time < ALTITUDE_S:

@@ -73,7 +73,7 @@ def write_geotiff(track: Track, path: Path, options: ExportOptions) -> None:
     place = row * shape[1] + column
 
     def summed(values: Array) -> Array:
-        return np.bincount(place, values, shape[0] * shape[1])
+        return np.asarray(np.bincount(place, values, shape[0] * shape[1]), float)
 
     count = summed(np.ones(len(x)))
     with np.errstate(invalid="ignore", divide="ignore"):
