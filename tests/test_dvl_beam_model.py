@@ -65,7 +65,8 @@ def test_directions_follow_azimuth_and_angle_and_a_concave_head_is_turned():
     ("beams", "said"),
     [
         ("{angle_deg: 0, azimuth_deg: [0, 120, 240]}", "angle_deg"),
-        ("{angle_deg: 90, azimuth_deg: [0, 120, 240]}", "angle_deg"),
+        ("{angle_deg: 90, azimuth_deg: [0, 120, 240]}", "angle_deg: the beams are at right angles"),
+        ("{angle_deg: 180, azimuth_deg: [0, 120, 240]}", "angle_deg"),
         ("{angle_deg: 30, azimuth_deg: [0, 180]}", "do not span"),
         ("{angle_deg: 30, azimuth_deg: [0, 180, 0, 180]}", "do not span"),
         ("{angle_deg: 30, azimuth_deg: [0, 1, 2, 3, 4, 5, 6, 7, 8]}", "azimuth_deg"),
@@ -243,10 +244,34 @@ def reordered(time: Array, along: Array) -> None:
     along[:] = along[:, [3, 2, 1, 0]]
 
 
+def seen_by(*signs: float) -> Callable[[Array, Array], None]:
+    """Beams that agree, of a head whose axes are of other signs."""
+    d = beam_geometry(parse_config(f"dvl: {{beams: {JANUS}}}").dvl).directions
+
+    def alter(time: Array, along: Array) -> None:
+        along[:] = along @ np.linalg.pinv(d).T * signs @ d.T
+
+    return alter
+
+
+mirrored = seen_by(1.0, -1.0, -1.0)  # z up, and y to port
+
+
+def test_a_head_whose_z_axis_points_away_from_the_bottom_is_as_good(case):
+    log, config = dive(case)
+    altered, _ = dive(case, mirrored)
+    log = replace(log, streams={**log.streams, BEAMS: altered[BEAMS]})
+    turned = {"beams": {**JANUS, "angle_deg": 157.5, "azimuth_deg": [225.0, 135.0, 45.0, 315.0]}}
+    p, _ = end(log, changed(config, dvl=turned))
+    expected, _ = end(*dive(case, seen_by(1.0, 1.0, 1.0)))
+    np.testing.assert_allclose(p, expected, atol=1e-6)
+
+
 WRONG = {
     "reversed": (lambda t, b: np.negative(b, out=b), "units: {dvl_beam_velocity: -m/s}"),
     "mm/s": (lambda t, b: np.multiply(b, 1000.0, out=b), "units: {dvl_beam_velocity: mm/s}"),
     "another order": (reordered, "azimuth_deg: [45, 315, 225, 135], which fits"),
+    "z away from the bottom": (mirrored, "angle_deg: 157.5, azimuth_deg: [225, 135, 45, 315]"),
     "no geometry of theirs": (lambda t, b: np.copyto(b, b + 0.5), "check dvl.beams"),
 }
 

@@ -181,8 +181,10 @@ def _set_or_logged(mps: float | str) -> float | str:
 class DvlBeams(ConfigSection):
     """Where the beams of a DVL point, in its own axes (docs/beams.md)."""
 
-    angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = Field(
-        None, description="angle between each beam and the z axis; null = not known, so that velocities are used"
+    angle_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
+        None,
+        description="angle between each beam and the z axis, beyond 90 where z points away from the bottom; "
+        "null = not known, so that velocities are used",
     )
     azimuth_deg: Annotated[tuple[float, ...], Field(max_length=8)] = Field(
         (), description="of each beam in the order of its numbers, clockwise from the x axis seen from above"
@@ -199,6 +201,8 @@ class DvlBeams(ConfigSection):
             return self
         around = np.deg2rad(self.azimuth_deg)
         directions = np.column_stack([np.cos(around), np.sin(around), np.ones(len(around))])
+        if abs(self.angle_deg - 90.0) < 1.0:
+            raise PydanticCustomError("beams_level", "angle_deg: the beams are at right angles to z, and see no bottom")
         if len(around) < 3 or np.linalg.svd(directions, compute_uv=False)[-1] < 0.1:
             raise PydanticCustomError(
                 "beams_span", "azimuth_deg: the beams do not span three axes, expected three or more different azimuths"

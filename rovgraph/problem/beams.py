@@ -5,7 +5,7 @@
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import permutations
 from typing import NamedTuple
 
@@ -100,8 +100,8 @@ def _of_velocities(
     along, v = beams.velocity[good], v[good]
     inverse = np.linalg.pinv(geometry.directions).T
 
-    def off(along: Array) -> float:
-        return float(np.median(np.linalg.norm(along @ inverse - v, axis=1) / np.linalg.norm(v, axis=1)))
+    def off(along: Array, of: Array = inverse) -> float:
+        return float(np.median(np.linalg.norm(along @ of - v, axis=1) / np.linalg.norm(v, axis=1)))
 
     now = off(along)
     if now < AGREES:
@@ -110,16 +110,22 @@ def _of_velocities(
     for unit, factor in UNITS["speed"].items():
         for sign in ("", "-"):
             if off((-factor if sign else factor) * along) < AGREES:
-                return WrongHead(
-                    "sign" if sign else "unit", differs, f"state units: {{dvl_beam_velocity: {sign}{unit}}}"
-                )
-    azimuths = dvl.beams.azimuth_deg
+                remedy = f"state units: {{dvl_beam_velocity: {sign}{unit}}}"
+                return WrongHead("sign" if sign else "unit", differs, remedy)
+    azimuths, angle = dvl.beams.azimuth_deg, dvl.beams.angle_deg or 0.0
+    if off(along, inverse * [1.0, -1.0, -1.0]) < AGREES:
+        remedy = f"z points the other way: state dvl.beams: {{angle_deg: {180.0 - angle:g}, azimuth_deg: "
+        return WrongHead("axes", differs, f"{remedy}{_listed([-azimuth % 360.0 for azimuth in azimuths])}}}")
     for order in permutations(range(len(azimuths))) if len(azimuths) <= MOST_ORDERED else ():
         if off(along[:, list(order)]) < AGREES:
-            fits = [azimuths[order.index(k)] for k in range(len(order))]
-            text = ", ".join(f"{azimuth:g}" for azimuth in fits)
-            return WrongHead("axes", differs, f"state dvl.beams.azimuth_deg: [{text}], which fits")
+            fits = _listed([azimuths[order.index(k)] for k in range(len(order))])
+            return WrongHead("axes", differs, f"state dvl.beams.azimuth_deg: {fits}, which fits")
     return WrongHead("contradiction", differs, "check dvl.beams and the axes of the velocity (rovgraph check)")
+
+
+def _listed(values: Iterable[float]) -> str:
+    """Numbers as YAML has them."""
+    return f"[{', '.join(f'{value:g}' for value in values)}]"
 
 
 def beam_contexts(config: Config, origin_b: ArrayLike) -> Array:
@@ -170,7 +176,9 @@ class PingsByBeams:
         """
         beams = beams_of(pings.data, self._numbers)
         taken, self.refusals = taken_by_beams(beams, accepted, self.config.dvl, self.refusals)
-        down = np.where(np.isfinite(beams.distance), beams.distance, beams.range * self._context[:, at.BEAM + 2])
+        down = np.where(
+            np.isfinite(beams.distance), beams.distance, beams.range * np.abs(self._context[:, at.BEAM + 2])
+        )
         seen = np.isfinite(down)
         altitude = np.where(seen, down, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
         sd = np.fmin(np.fmax(beams.sd, beam_sd(self.config.dvl)), LARGEST_SD)

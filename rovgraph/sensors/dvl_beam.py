@@ -56,7 +56,8 @@ def beam_geometry(dvl: Dvl) -> BeamGeometry | None:
         return None
     angle = np.deg2rad(beams.angle_deg)
     if beams.phased:
-        angle = np.arcsin(min(np.sin(angle) * beam_sound_speed(dvl) / PHASED_C0, 1.0 - 1e-9))
+        steered = np.arcsin(min(np.sin(angle) * beam_sound_speed(dvl) / PHASED_C0, 1.0 - 1e-9))
+        angle = steered if beams.angle_deg < 90.0 else np.pi - steered
     azimuth = np.deg2rad(np.array(beams.azimuth_deg) + (0.0 if beams.convex else 180.0))
     around = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
     down = np.ones((len(azimuth), 1))

@@ -76,7 +76,7 @@ def ranges(log: Log, config: Config) -> Iterator[Finding]:
     near = nearest(altitude.time, pings.time)
     high = altitude.data[near, 0]
     usable = (np.abs(altitude.time[near] - pings.time) < ONE_PING_S) & (high > 0.0)
-    beams, cosine = beams_of(pings.data, geometry.numbers), float(geometry.directions[:, 2].mean())
+    beams, cosine = beams_of(pings.data, geometry.numbers), abs(float(geometry.directions[:, 2].mean()))
     for name, other, measured, expected in (
         ("range", "distance", beams.range, 1.0 / cosine),
         ("distance", "range", beams.distance, cosine),
