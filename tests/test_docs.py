@@ -62,6 +62,7 @@ EXAMPLES = {  # what each of them has to say
     "own_sensor": r"without ranges: 0\.98 m rms.*\nwith ranges: 0\.17 m rms",
     "live": r"start: heading from mag, dvl_heading\n(.*\n)*6\d solutions, the last at \[6\.",
     "export": r"xarray.Dataset",
+    "bottom": r"19\d\d soundings(.*\n)*altitude 6\.\d to 9\.\d m",
     "native_files": r"dvl.csv: .* by acceleration .*\ntrusted, .* m rms\nmaps",
 }
 
@@ -288,7 +289,7 @@ def remembered() -> Callable[..., rg.Result]:
     smooth = rg.smooth
 
     def again(log: rg.Log, config: rg.Config, **options: object) -> rg.Result:
-        key = (log.source, len(log["imu"]), config.to_yaml(), *options.items())
+        key = (log.source, len(log.streams.get("imu", ())), config.to_yaml(), *options.items())
         if key not in results or log.source == "log" or " " in log.source:  # what has no file is not told by its name
             results[key] = smooth(log, config, **options)
         return results[key]

@@ -137,7 +137,7 @@ def test_a_known_latency_of_the_dvl_is_that_of_its_beams(files, tmp_path):
 HOSTILE = {
     "no time": ("valid_1\n1\n", "no column time"),
     "no beam": ("time,depth\n1,2\n", "no column valid_1, velocity_1, range_1 or distance_1"),
-    "text": ("time,valid_1,range_1\n1,1,near\n", "column dvl_beam_range_1: 'near' is not a number"),
+    "text": ("time,valid_1,range_1\n1,1,near\n", "column range_1: 'near' is not a number"),
     "text as time": ("time,valid_1\nnoon,1\n", "line 2, column time: 'noon' is neither seconds nor a date"),
     "a validity that is none": ("time,valid_1\n1,1\n2,0.5\n", "line 3, column dvl_beam_valid_1: 0.5, expected 0 or 1"),
     "a number beyond the last": ("time,valid_1,valid_9\n1,1,1\n", "column valid_9: beams are numbered 0 to 8"),

@@ -23,6 +23,7 @@ from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
 from rovgraph.log.streams import labels
+from rovgraph.sensors import SENSORS
 
 HEADER = recorded_columns()
 EPOCH = 1.7e9
@@ -46,7 +47,8 @@ def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
         sensor: RNG.normal(size=(20, len(columns))) * 10.0 ** RNG.integers(-9, 4, (20, len(columns)))
         for sensor, columns in STREAMS.items()
     }
-    sent["dvl"][:, 3] = 1.0
+    for sensor in sent:
+        sent[sensor][:, [column.flag for column in SENSORS[sensor].columns]] = 1.0
     for sensor, columns in STREAMS.items():
         for k, name in enumerate(columns):
             sent[sensor][:, k] = np.abs(sent[sensor][:, k]) if name.endswith("_sd") else sent[sensor][:, k]

@@ -542,7 +542,7 @@ def test_a_report_without_bottom_lock_is_a_lost_ping_whatever_else_it_says(heard
 )
 def test_reports_of_other_kinds_are_ignored_and_bad_ones_counted(data, kinds, heard):
     (message,) = decoded(waterlinked("w", heard), data + report())
-    assert len(message.readings) == 2
+    assert [r.sensor for r in message.readings] == ["dvl", "dvl_altitude", "dvl_beams"]
     assert heard.kinds == kinds
 
 
@@ -1090,9 +1090,9 @@ def test_everything_together_over_the_loopback(tmp_path, impatient):
             for message in feed:
                 if message is not None:
                     found.update(r.sensor for r in message.readings)
-                if len(found) == 4 or time.monotonic() - begin > HANGS_S:
+                if len(found) == 5 or time.monotonic() - begin > HANGS_S:
                     break
-    assert found == {"dvl": 1, "dvl_altitude": 1, "imu": 1, "ahrs": 1}
+    assert found == {"dvl": 1, "dvl_altitude": 1, "dvl_beams": 1, "imu": 1, "ahrs": 1}
 
 
 def test_a_gzipped_telemetry_log_and_a_plain_one_are_the_same(real_tlog, tmp_path):

@@ -363,7 +363,7 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: (f / "dvl_beams.csv").write_text("time,valid_1\n1,x\n"), "line 2, column valid_1: 'x' is not a num"),
         (
             lambda f: (f / "dvl_beams.csv").write_text("time,valid_1\n1,7\n"),
-            "line 2, column valid_1: 7, expected 0 or 1",
+            "line 2, column dvl_beam_valid_1: 7, expected 0 or 1",
         ),
     ],
 )

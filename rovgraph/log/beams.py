@@ -36,24 +36,23 @@ def beams_of_table(table: Table, config: Config) -> Stream:
     -----
     DataWarning : what was left out or sorted
     """
-    named: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for name in table.names:
         if match := _COLUMN.fullmatch(name):
             if int(match[2]) not in NUMBERS:
                 raise InputError(f"{table.source}: column {name}: beams are numbered 0 to {NUMBERS[-1]}")
-            named[name] = PREFIX + name
-    mapped = {
+            columns[PREFIX + name] = name
+    columns |= {
         target: column
         for target, column in config.columns.items()
         if column in table.names and (target == "time" or target.startswith(PREFIX))
     }
-    if not (named or mapped.keys() - {"time"}):
+    if not columns.keys() - {"time"}:
         raise InputError(
             f"{table.source}: no column valid_1, velocity_1, range_1 or distance_1, expected those of each beam"
         )
-    kept = ["time", *named, *mapped.values()]
-    frame = table.frame[[name for name in table.names if name in kept]].rename(columns=named)
-    own = config.as_recorded().model_copy(update={"columns": mapped, "delay_s": {BEAMS: delay_of(config, BEAMS)}})
+    frame = table.frame[[name for name in table.names if name == "time" or name in columns.values()]]
+    own = config.as_recorded().model_copy(update={"columns": columns, "delay_s": {BEAMS: delay_of(config, BEAMS)}})
     streams, _ = read_streams([replace(table, frame=frame)], own, table.source)
     return streams[BEAMS]
 

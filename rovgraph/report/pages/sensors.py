@@ -124,8 +124,8 @@ def dvl_section(source: DiveSource) -> Section:
     title, clock, pings = "DVL", source.clock, source.pings
     if pings is None:
         why = "the folder has no dvl.csv: no DVL, or an older version"
-        alone = [Missing("Pings", why)] if source.beams is None else _by_beams(source, [])
-        return Section("dvl", title, (), alone, finding="There are no pings to show.")
+        alone = [] if source.beams is None else _by_beams(source, [])
+        return Section("dvl", title, (), [Missing("Pings", why), *alone], finding="There are no pings to show.")
     time, lock = pings["time"].to_numpy(float), pings["lock"].to_numpy(float)
     items: list[Item] = []
     spans = [(*clock(np.array(s)).tolist(), SHADE) for s in source.silences]
