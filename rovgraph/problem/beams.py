@@ -107,18 +107,19 @@ def _of_velocities(
     if now < AGREES:
         return None
     differs = f"the velocity of the DVL's beams differs from its own by {now:.0%}"
+    explained: list[tuple[float, Kind, str]] = []
     for unit, factor in UNITS["speed"].items():
         for sign in ("", "-"):
-            if off((-factor if sign else factor) * along) < AGREES:
-                return WrongHead(
-                    "sign" if sign else "unit", differs, f"state units: {{dvl_beam_velocity: {sign}{unit}}}"
-                )
+            kind: Kind = "sign" if sign else "unit"
+            fits = off((-factor if sign else factor) * along)
+            explained.append((fits, kind, f"state units: {{dvl_beam_velocity: {sign}{unit}}}"))
     azimuths = dvl.beams.azimuth_deg
     for order in permutations(range(len(azimuths))) if len(azimuths) <= MOST_ORDERED else ():
-        if off(along[:, list(order)]) < AGREES:
-            fits = [azimuths[order.index(k)] for k in range(len(order))]
-            text = ", ".join(f"{azimuth:g}" for azimuth in fits)
-            return WrongHead("axes", differs, f"state dvl.beams.azimuth_deg: [{text}], which fits")
+        text = ", ".join(f"{azimuths[order.index(k)]:g}" for k in range(len(order)))
+        explained.append((off(along[:, list(order)]), "axes", f"state dvl.beams.azimuth_deg: [{text}], which fits"))
+    best, why, remedy = min(explained)  # several fit a dive that is level and straight, the right one best
+    if best < AGREES:
+        return WrongHead(why, differs, remedy)
     return WrongHead("contradiction", differs, "check dvl.beams and the axes of the velocity (rovgraph check)")
 
 
