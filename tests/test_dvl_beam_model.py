@@ -17,7 +17,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
 from rovgraph.model.config import Config, parse_config
-from rovgraph.problem.beams import beam_sensors
+from rovgraph.problem.beams import beam_sensors, head_against_velocity
 from rovgraph.sensors.dvl_beam import (
     BEAMS,
     Refusals,
@@ -109,6 +109,7 @@ AGREES, CHOOSES = Refusals(True, 2, 0), Refusals(True, 5, 5)  # most of the refu
     ("accepted", "off", "valid", "seen", "taken"),
     [
         (1.0, 0.1, 4, CHOOSES, 4),  # it has made a velocity: gates judge its beams
+        (1.0, 0.0, 2, CHOOSES, 0),  # of more beams than the log has, so that its velocity knows more
         (0.0, 0.0, 4, AGREES, 4),  # refused, and yet its beams agree as those of most do
         (0.0, 0.0, 4, CHOOSES, 0),  # refused, and agrees by chance
         (0.0, 0.05, 4, AGREES, 0),  # refused, and they do not
@@ -288,6 +289,23 @@ def test_beams_that_are_wrong_are_named_and_their_velocities_used(case, wrong, s
     assert not used and said in why
     used, why = beam_sensors(config, {**log.streams, BEAMS: right, "dvl": velocity})
     assert used and not why
+
+
+def test_of_orders_that_nearly_fit_a_level_straight_dive_the_right_one_is_named(case):
+    """A wrong order of the fore beams misses only sway; azimuths turned about miss only the vertical."""
+    log, config = dive(case)
+    azimuths = config.dvl.beams.azimuth_deg
+    velocity, pings = log["dvl"].data.copy(), log[BEAMS].data.copy()
+    velocity[:, :3] = [0.5, 0.01, 0.01]
+    velocity[:, 3] = 1.0
+    pings[:, 1 : 5 * len(azimuths) : 5] = velocity[:, :3] @ beam_geometry(config.dvl).directions.T
+    pings[:, 0 : 5 * len(azimuths) : 5] = 1.0
+    streams = {"dvl": replace(log["dvl"], data=velocity), BEAMS: replace(log[BEAMS], time=log["dvl"].time, data=pings)}
+    turned = [azimuths[-1], *azimuths[:-1]]
+    named = "azimuth_deg: [" + ", ".join(f"{azimuth:g}" for azimuth in azimuths) + "]"
+    assert named in head_against_velocity(changed(config, dvl={"beams": {"azimuth_deg": turned}}), streams).remedy
+    about = [(azimuth + 180.0) % 360.0 for azimuth in azimuths]
+    assert named in head_against_velocity(changed(config, dvl={"beams": {"azimuth_deg": about}}), streams).remedy
 
 
 def test_beams_by_another_clock_or_of_another_head_are_named(case):

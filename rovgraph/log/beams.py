@@ -47,6 +47,8 @@ def beams_of_table(table: Table, config: Config) -> Stream:
         for target, column in config.columns.items()
         if column in table.names and (target == "time" or target.startswith(PREFIX))
     }
+    if "time" not in {*table.names, *columns}:
+        raise InputError(f"{table.source}: no column time, expected seconds of the log's clock")
     if not columns.keys() - {"time"}:
         raise InputError(
             f"{table.source}: no column valid_1, velocity_1, range_1 or distance_1, expected those of each beam"

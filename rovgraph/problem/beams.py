@@ -35,7 +35,7 @@ from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import LARGEST_SD, Kind
 
 MOVING, SDS = 0.1, 5.0  # speed at which beams and velocity are compared [m/s], and times the noise of a beam
-AGREES, ENOUGH = 0.15, 20  # part of the speed, and pings
+AGREES, ENOUGH = 0.06, 20  # part of the speed, and pings
 SAME_STAMPS = 0.5  # share of pings whose beams and velocity have one stamp
 MOST_ORDERED = 5  # beams whose orders are tried
 ONE_PING_S = 0.01  # stamps of beams and velocity of one ping differ by less
@@ -94,7 +94,7 @@ def _of_velocities(
     """The same by the numbers: ``data``, rows of the stream "dvl", which belong to pings of beams where ``same``."""
     v = data[:, :3]
     good = same & (data[:, 3] == 1.0) & (np.linalg.norm(v, axis=1) > max(MOVING, SDS * beam_sd(dvl)))
-    good &= beams.valid.all(axis=1) & np.isfinite(beams.velocity).all(axis=1)
+    good &= beams.valid.all(axis=1) & (np.abs(beams.velocity) < LARGEST_SD).all(axis=1)
     if np.count_nonzero(good) < ENOUGH:
         return None
     along, v = beams.velocity[good], v[good]
@@ -107,19 +107,22 @@ def _of_velocities(
     if now < AGREES:
         return None
     differs = f"the velocity of the DVL's beams differs from its own by {now:.0%}"
+    explained: list[tuple[float, Kind, str]] = []
     for unit, factor in UNITS["speed"].items():
         for sign in ("", "-"):
-            if off((-factor if sign else factor) * along) < AGREES:
-                remedy = f"state units: {{dvl_beam_velocity: {sign}{unit}}}"
-                return WrongHead("sign" if sign else "unit", differs, remedy)
+            kind: Kind = "sign" if sign else "unit"
+            fits = off((-factor if sign else factor) * along)
+            explained.append((fits, kind, f"state units: {{dvl_beam_velocity: {sign}{unit}}}"))
     azimuths, angle = dvl.beams.azimuth_deg, dvl.beams.angle_deg or 0.0
-    if off(along, inverse * [1.0, -1.0, -1.0]) < AGREES:
-        remedy = f"z points the other way: state dvl.beams: {{angle_deg: {180.0 - angle:g}, azimuth_deg: "
-        return WrongHead("axes", differs, f"{remedy}{_listed([-azimuth % 360.0 for azimuth in azimuths])}}}")
+    remedy = f"state dvl.beams: {{angle_deg: {180.0 - angle:g}, azimuth_deg: "
+    remedy += f"{_listed(-azimuth % 360.0 for azimuth in azimuths)}}}, as z points the other way"
+    explained.append((off(along, inverse * [1.0, -1.0, -1.0]), "axes", remedy))
     for order in permutations(range(len(azimuths))) if len(azimuths) <= MOST_ORDERED else ():
-        if off(along[:, list(order)]) < AGREES:
-            fits = _listed([azimuths[order.index(k)] for k in range(len(order))])
-            return WrongHead("axes", differs, f"state dvl.beams.azimuth_deg: {fits}, which fits")
+        text = _listed(azimuths[order.index(k)] for k in range(len(order)))
+        explained.append((off(along[:, list(order)]), "axes", f"state dvl.beams.azimuth_deg: {text}, which fits"))
+    best, why, remedy = min(explained)  # several fit a dive that is level and straight, the right one best
+    if best < AGREES:
+        return WrongHead(why, differs, remedy)
     return WrongHead("contradiction", differs, "check dvl.beams and the axes of the velocity (rovgraph check)")
 
 

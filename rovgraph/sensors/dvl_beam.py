@@ -269,7 +269,8 @@ def taken_by_beams(beams: Beams, accepted: Array, dvl: Dvl, seen: Refusals) -> t
     kinds = int((four & agree).sum()), int((four & ~agree).sum())
     after = Refusals(bool(seen.chooses or chooses.any()), seen.agreeing + kinds[0], seen.disagreeing + kinds[1])
     agree = np.where(count > 3, agree & (more >= MOSTLY), count < np.where(chooses, 3, 4))
-    return np.asarray(good & ((accepted != 0.0) | agree)[:, None]), after
+    made = (accepted == 1.0) & (count > 2)  # of fewer it is not made: others of the table are missing
+    return np.asarray(good & (made | np.isnan(accepted) | ((accepted == 0.0) & agree))[:, None]), after
 
 
 def _has_any(values: Array) -> NDArray[np.bool_]:

@@ -61,7 +61,7 @@ def beams(log: Log, config: Config) -> Iterator[Finding]:
     if BEAMS not in log or beam_geometry(config.dvl) is None or config.dvl.use == "velocity":
         return
     if (found := head_against_velocity(config, log.streams)) is None:
-        yield Finding(BEAMS, "ok", "beams as configured, by the velocities of the same pings")
+        yield Finding(BEAMS, "ok", "no velocity of a ping contradicts its beams as configured")
     else:
         kind = found.kind if config.dvl.use == "beams" else ""
         yield Finding(BEAMS, "warning", f"{found.text}: {found.remedy}", kind)
