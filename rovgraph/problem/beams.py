@@ -98,7 +98,7 @@ def _of_velocities(
     if np.count_nonzero(good) < ENOUGH:
         return None
     along, v = beams.velocity[good], v[good]
-    inverse = np.linalg.pinv(geometry.directions).T
+    inverse: Array = np.asarray(np.linalg.pinv(geometry.directions).T, dtype=np.float64)
 
     def off(along: Array, of: Array = inverse) -> float:
         return float(np.median(np.linalg.norm(along @ of - v, axis=1) / np.linalg.norm(v, axis=1)))
