@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dives import below_a_ship, campaign_log, same
+from dives import below_a_ship, campaign_log, falcon, same, simulated
+from live import flown
 
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
@@ -443,3 +444,11 @@ def test_isam2_ends_where_the_chain_does():
     a, b = (smooth(log, one, "smoothed").estimates[0].trajectory for one in (config, isam2))
     np.testing.assert_allclose(a.p_n[-1], b.p_n[-1], atol=1e-3)
     np.testing.assert_allclose(a.cov_p[-1], b.cov_p[-1], rtol=1e-2)
+
+
+def test_a_configuration_that_is_written_in_full_expects_no_acoustics_live():
+    case = simulated(falcon(), 15.0, imu_rate=50.0)
+    whole = parse_config(case.config.to_yaml())
+    assert "usbl" in whole.model_fields_set
+    known = flown(replace(case, config=whole)).navigator.engine.initial.instruments
+    assert "dvl" in known and not {"usbl", "range"} & known.keys()

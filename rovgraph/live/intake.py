@@ -274,8 +274,9 @@ class Startup:
         self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]
-        stated = self.config.model_fields_set
-        later = [s for s in later if s.name not in ACOUSTICS or s.name in stated]
+        sections = {name: getattr(self.config, name) for name in ACOUSTICS}
+        unstated = {name for name, section in sections.items() if section == type(section)()}  # as a whole file has it
+        later = [s for s in later if s.name not in unstated]
         expected = {s.name for s in later if s.heading_source is None or named}
         log = gathered(self.measurements, "so far", origin)
         try:
