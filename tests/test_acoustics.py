@@ -447,7 +447,7 @@ def test_isam2_ends_where_the_chain_does():
 
 
 def test_a_configuration_that_is_written_in_full_expects_no_acoustics_live():
-    case = simulated(falcon(), 15.0, imu_rate=50.0)
+    case = simulated(falcon(), 45.0, imu_rate=50.0)
     whole = parse_config(case.config.to_yaml())
     assert "usbl" in whole.model_fields_set
     known = flown(replace(case, config=whole)).navigator.engine.initial.instruments
