@@ -80,7 +80,10 @@ def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> Wron
     if unknown and np.isfinite(every.velocity[:, [every.numbers.index(k) for k in unknown]]).any():
         numbers, known = ", ".join(map(str, unknown)), ", ".join(map(str, geometry.numbers))
         text = f"the log has velocities of beams {numbers}, and dvl.beams those of {known}"
-        return WrongHead("axes", text, "correct dvl.beams.azimuth_deg or first_number")
+        measured = [k for k in every.numbers if np.isfinite(every.velocity[:, every.numbers.index(k)]).any()]
+        shifted = len(measured) == len(geometry.numbers) and measured[0] in (0, 1)
+        remedy = f"state dvl.beams.first_number: {measured[0]}" if shifted else "correct dvl.beams.azimuth_deg"
+        return WrongHead("axes", text, remedy)
     same = np.abs(dvl.time[near] - pings.time) < ONE_PING_S
     if same.mean() < SAME_STAMPS and len(same) >= ENOUGH:
         text = f"{same.mean():.0%} of the beams' stamps are those of a velocity"
