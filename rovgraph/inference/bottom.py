@@ -5,7 +5,7 @@ A range meets the bottom at ``p_n + a``, with the arm from the body's origin
     a = R_nb (l_b + R_bs d rho)
 
 d is the unit vector of the beam and rho the range along it, less the scale error of the DVL where that is one of sound
-speed. ``distance`` and ``dvl_altitude`` are along the DVL's own z axis, as makers state them: rho = distance / d_z.
+speed. ``distance`` and ``dvl_altitude`` are along the DVL's own z axis, as makers state them: rho = distance / |d_z|.
 
 The bottom about the vehicle is a plane, ``a_down = h + g (a_north, a_east)``, with the altitude h straight down from
 the body's origin and the slope g. It is fitted to the ranges of each ping, with a prior of the slope, so that one range
@@ -157,7 +157,7 @@ class _Ranges:
             beams = beams_of(streams[BEAMS].data, geometry.numbers)
             angle = np.array([[self.value(f"{BEAM_SENSORS[k]}_angle")] for k in geometry.numbers])
             d = geometry.directions + angle * geometry.tilts
-            rho = np.where(np.isfinite(beams.range), beams.range, beams.distance / d[:, 2])
+            rho = np.where(np.isfinite(beams.range), beams.range, beams.distance / np.abs(d[:, 2]))
             if np.isfinite(rho).any():
                 return geometry.numbers, streams[BEAMS].time, d, rho
         if "dvl_altitude" not in streams:
