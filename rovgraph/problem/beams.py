@@ -70,17 +70,22 @@ class WrongHead(NamedTuple):
 
 
 def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> WrongHead | None:
-    """What is wrong with a log's beams, by the velocities that the instrument makes of them; None = nothing is seen."""
+    """What is wrong with a log's beams, by the velocities that the instrument makes of them; None = nothing is seen.
+
+    Parameters
+    ----------
+    streams : of a log, "dvl_beams" among them, velocities in the DVL's axes [m/s]
+    """
     geometry = beam_geometry(config.dvl)
     if geometry is None or "dvl" not in streams or not len(streams["dvl"]):
         return None
     pings, dvl = streams[BEAMS], streams["dvl"]
     every, near = beams_of(pings.data), nearest(dvl.time, pings.time)
-    beams, unknown = beams_of(pings.data, geometry.numbers), sorted({*every.numbers} - {*geometry.numbers})
-    if unknown and np.isfinite(every.velocity[:, [every.numbers.index(k) for k in unknown]]).any():
+    moving = np.isfinite(every.velocity).any(axis=0)
+    measured = [k for k, moves in zip(every.numbers, moving, strict=True) if moves]
+    if unknown := sorted({*measured} - {*geometry.numbers}):
         numbers, known = ", ".join(map(str, unknown)), ", ".join(map(str, geometry.numbers))
         text = f"the log has velocities of beams {numbers}, and dvl.beams those of {known}"
-        measured = [k for k in every.numbers if np.isfinite(every.velocity[:, every.numbers.index(k)]).any()]
         shifted = len(measured) == len(geometry.numbers) and measured[0] in (0, 1)
         remedy = f"state dvl.beams.first_number: {measured[0]}" if shifted else "correct dvl.beams.azimuth_deg"
         return WrongHead("axes", text, remedy)
@@ -88,6 +93,7 @@ def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> Wron
     if same.mean() < SAME_STAMPS and len(same) >= ENOUGH:
         text = f"{same.mean():.0%} of the beams' stamps are those of a velocity"
         return WrongHead("contradiction", text, "state delay_s.dvl_beams, or convert the native files again")
+    beams = beams_of(pings.data, geometry.numbers)
     return _of_velocities(config.dvl, geometry, beams, dvl.data[near], same)
 
 

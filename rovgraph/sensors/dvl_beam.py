@@ -7,7 +7,7 @@ moves in the direction in which the beam points (docs/beams.md).
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +49,7 @@ class BeamGeometry(NamedTuple):
     tilts: Array
 
 
+@lru_cache(maxsize=8)  # asked for at each ping
 def beam_geometry(dvl: Dvl) -> BeamGeometry | None:
     """Where the beams of a DVL point; None where the configuration does not say so."""
     beams = dvl.beams
@@ -72,6 +73,7 @@ def beam_sound_speed(dvl: Dvl) -> float:
     return dvl.sound_speed_mps or USUAL_C
 
 
+@lru_cache(maxsize=8)
 def beam_sd(dvl: Dvl) -> float:
     """Noise of the velocity along a beam: as stated, or by that of the velocity of the whole head [m/s]."""
     geometry = beam_geometry(dvl)
