@@ -19,7 +19,7 @@ import pandas as pd
 from fault_campaign.acoustic import Acoustic, Ship, System, heard_by_receivers, ranges, usbl
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import Streams, sample
-from fault_campaign.judge import Dive, Result, run_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, run_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
@@ -315,18 +315,7 @@ def run_row(name: str, seed: int, online: bool) -> Result:
 
 def figures(name: str, results: Sequence[Result]) -> str:
     """A row of the table."""
-    cells = [name]
-    for kind in ("smoothed", "filtered", "online"):
-        done = [r for r in results if kind in r.rms]
-        if not done:
-            cells += ["–", "–"]
-            continue
-        rms, sd = (float(np.sqrt(np.mean([getattr(r, what)[kind] ** 2 for r in done]))) for what in ("rms", "sd"))
-        nees = {q: float(np.mean([r.nees[kind][q] for r in done])) for q in ("position", "depth", "heading")}
-        cells += [f"{rms:.2f} ({sd:.2f})", "; ".join(f"{value:.2g}" for value in nees.values())]
-    verdicts = [r.verdicts.get("smooth", "refused") for r in results]
-    cells.append(", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts)))
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join([name, *estimate_cells(results)]) + " |"
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import pandas as pd
 from fault_campaign.beams import Beams, Bottom, Fault, Head, bias, lose, refuse, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, run_command, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, run_command, run_dive, write_dive
 from fault_campaign.motion import Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
@@ -289,17 +289,7 @@ def figures(name: str, runs: Runs) -> str:
     """A row of the table."""
     text, met = ROWS[name].outcome(runs)
     cells = [name, ROWS[name].target, text, "yes" if met else "**no**"]
-    results = next(iter(runs.values()))
-    for kind in ("smoothed", "filtered", "online"):
-        done = [r for r in results if kind in r.rms]
-        if not done:
-            cells += ["–", "–"]
-            continue
-        error, sd = (float(np.sqrt(np.mean([getattr(r, what)[kind] ** 2 for r in done]))) for what in ("rms", "sd"))
-        nees = [float(np.mean([r.nees[kind][q] for r in done])) for q in ("position", "depth", "heading")]
-        cells += [f"{error:.2f} ({sd:.2f})", "; ".join(f"{value:.2g}" for value in nees)]
-    verdicts = [r.verdicts.get("smooth", "refused") for r in results]
-    cells.append(", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts)))
+    cells += estimate_cells(next(iter(runs.values())))
     return "| " + " | ".join(cells) + " |"
 
 

@@ -347,6 +347,21 @@ class Outcome:
         return max(found, key=lambda entry: entry[1], default=("", float("nan")))
 
 
+def estimate_cells(results: Sequence[Result]) -> list[str]:
+    """Cells of a table row: rms (sd) [m] and NEES of each estimate over some dives, and the verdicts."""
+    cells = []
+    for kind in ("smoothed", "filtered", "online"):
+        done = [r for r in results if kind in r.rms]
+        if not done:
+            cells += ["–", "–"]
+            continue
+        rms, sd = (float(np.sqrt(np.mean([getattr(r, what)[kind] ** 2 for r in done]))) for what in ("rms", "sd"))
+        nees = [float(np.mean([r.nees[kind][q] for r in done])) for q in ("position", "depth", "heading")]
+        cells += [f"{rms:.2f} ({sd:.2f})", "; ".join(f"{value:.2g}" for value in nees)]
+    verdicts = [r.verdicts.get("smooth", "refused") for r in results]
+    return [*cells, ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))]
+
+
 def honest_nees(seeds: int) -> float:
     """What the mean NEES of an honest estimate exceeds in fewer than 1 of 100 campaigns; 2 for 20 seeds or more.
 
