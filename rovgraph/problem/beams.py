@@ -81,7 +81,7 @@ def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> Wron
         return None
     pings, dvl = streams[BEAMS], streams["dvl"]
     every, near = beams_of(pings.data), nearest(dvl.time, pings.time)
-    moving = np.isfinite(every.velocity).any(axis=0)
+    moving: NDArray[np.bool_] = np.asarray(np.isfinite(every.velocity).any(axis=0))
     measured = [k for k, moves in zip(every.numbers, moving, strict=True) if moves]
     if unknown := sorted({*measured} - {*geometry.numbers}):
         numbers, known = ", ".join(map(str, unknown)), ", ".join(map(str, geometry.numbers))
