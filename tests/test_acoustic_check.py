@@ -168,6 +168,7 @@ FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_and_its_remedy_mends_it(dive, fault):
     table, more, kind, words = FAULTS[fault]
@@ -218,6 +219,7 @@ def test_outliers_do_not_hide_a_lag_nor_make_one(dive):
         assert [f.kind for f in found(log, dive.configuration)] == kinds
 
 
+@pytest.mark.slow
 def test_answers_that_repeat_are_counted_once(dive):
     replies = dive.streams["usbl"]
     again = pd.concat([replies.assign(time=replies["time"] + k * 0.19) for k in range(4)]).sort_values("time")

@@ -519,6 +519,7 @@ def test_a_rovl_without_the_ships_heading_is_read_from_north(tmp_path):
     close(np.degrees(first(recording, "usbl").columns["usbl_bearing"]), 37.2)
 
 
+@pytest.mark.slow
 @given(changes=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), max_size=10))
 def test_changed_bytes_raise_nothing_but_a_refusal(changes, tmp_path_factory):
     data = bytearray(dive(SSB, MODEM, seatrac(), ROVL, "%D0033082031,0,-1,+4,+4,0.8,30,1200??40", seconds=3))

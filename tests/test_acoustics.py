@@ -386,6 +386,7 @@ def test_a_healthy_dive_is_trusted_and_has_no_late_stamps():
     assert not any("late" in line or "turn by" in line for line in found.assumptions)
 
 
+@pytest.mark.slow
 def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told():
     dive = acoustics.one_beacon(1, straight=False, seconds=700.0)
     _, found = rms(campaign_log(dive), dive)

@@ -80,6 +80,7 @@ def test_what_is_broken_is_named_with_a_remedy(name):
     assert all("\n" not in line for line in dive.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOISE)
 def test_what_is_found_is_said_believed_and_doubted_where_it_moves_the_track(name):
     case, dive = broken(name, 1, find_noise=True)
@@ -179,6 +180,7 @@ def test_alarms_of_a_filter_alone_need_no_smoother():
     assert any(line.startswith("dvl: up to") for line in broken.warnings)
 
 
+@pytest.mark.slow
 def test_a_field_that_changes_along_the_way_is_named_and_the_remedy_mends_it():
     case = simulated(falcon(heading={"sources": ["mag"]}), 150.0, 2, "lawnmower", imu_rate=50.0)
     mag, begin = case.log["mag"], case.log["imu"].time[0]

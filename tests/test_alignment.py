@@ -135,6 +135,7 @@ def test_after_a_silence_no_sensor_is_kept_out_for_long_and_attitude_is_as_sure_
     assert np.mean(heading > 5.0) < 0.1
 
 
+@pytest.mark.slow
 def test_linearised_where_it_stands_a_vague_attitude_would_be_believed_and_sensors_kept_out(monkeypatch):
     for module in (alignment, filter):
         monkeypatch.setattr(module, "POORLY_KNOWN", np.full(2, np.inf))

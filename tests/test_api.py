@@ -91,6 +91,7 @@ def test_every_promised_name_is_there_and_the_type_checker_knows_the_same():
         _ = rg.smoth
 
 
+@pytest.mark.slow
 def test_a_function_is_not_hidden_by_the_module_of_its_name_whichever_is_imported_first():
     code = """
 import rovgraph.report, rovgraph.simulate
@@ -117,6 +118,7 @@ def test_the_package_says_that_it_is_typed():
     assert (Path(rg.__file__).parent / "py.typed").is_file()
 
 
+@pytest.mark.slow
 def test_the_example_of_the_manual_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(str(Path(__file__).parents[1] / "docs" / "api.md"), module_relative=False)
@@ -173,6 +175,7 @@ def test_smooth_writes_what_the_command_writes(monkeypatch, capsys, tmp_path, fa
     assert len(result.warnings) >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["batch", "isam2"])
 def test_one_estimate_of_an_engine_is_that_of_the_command(monkeypatch, tmp_path, short, engine):
     log = tmp_path / "log.csv"
@@ -218,6 +221,7 @@ def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
     assert len(dive.log["dvl"]) == len(rg.read_log(tmp_path / "twin" / "log.csv", dive.config)["dvl"])
 
 
+@pytest.mark.slow
 def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
     """A minute of it; the whole dive is smoothed from the installed wheel."""
     monkeypatch.setattr("rovgraph.api.simulation.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
@@ -325,6 +329,7 @@ def test_a_run_that_cannot_be_is_refused_and_leaves_no_output_open(tmp_path):
         rg.Online().run("tcp://127.0.0.1:5", resume=True)
 
 
+@pytest.mark.slow
 def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):
     short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(tmp_path / "log.csv", index=False)
     for name in ("process_time", "thread_time", "perf_counter"):  # the same work takes the same time

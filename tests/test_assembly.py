@@ -156,6 +156,7 @@ def test_a_ping_that_comes_later_still_makes_a_keyframe_beside_that_of_the_gap()
     assert all(a.dt == 0.0 for a in found(problem, "dvl"))
 
 
+@pytest.mark.slow
 @given(
     period=st.sampled_from([0.5, 1.0, 2.0, 3.0]),
     rounding=st.lists(st.floats(-1e-4, 1e-4), min_size=6, max_size=6),
@@ -387,6 +388,7 @@ def test_a_log_at_the_time_of_a_clock_and_one_that_begins_with_pings_are_taken_a
     assembled(replace(log, streams=later))
 
 
+@pytest.mark.slow
 def test_what_comes_late_is_as_if_it_had_come_in_time(dive):
     measurements = [m for m in dive.log.measurements() if m.time < 32.0]
     in_time, late, rng = empty(started(dive)), empty(started(dive)), np.random.default_rng(4)

@@ -274,6 +274,7 @@ def write(log, path):
     return path
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_smooth_takes(run, tmp_path):
     path, out = write(at_rest(90.0), tmp_path / "log.csv"), tmp_path / "out"
     (tmp_path / "vehicle.yaml").write_text("name: mine\nimu: {noise: {gyr_walk: 2.0e-5}}\n")
@@ -298,6 +299,7 @@ def test_the_command_writes_what_smooth_takes(run, tmp_path):
     assert piece.imu.noise.gyr_walk == Config().imu.noise.gyr_walk
 
 
+@pytest.mark.slow
 def test_the_library_writes_what_the_command_writes(run, tmp_path):
     path = write(at_rest(90.0), tmp_path / "log.csv")
     assert run(path, "--out", tmp_path / "command")[0] == 0

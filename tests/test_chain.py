@@ -270,6 +270,7 @@ def test_both_say_the_same_of_the_calibration_as_the_dive_goes_on(solved):
         np.testing.assert_allclose(mine / np.outer(sd, sd), other / np.outer(sd, sd), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_noise_of_the_states_adds_as_much_information_to_both(solved):
     """The draws differ: so the mean of some is compared, to what a draw of them may differ by."""
     chain, graph = solved
@@ -285,6 +286,7 @@ def test_noise_of_the_states_adds_as_much_information_to_both(solved):
     assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < allowed).all()
 
 
+@pytest.mark.slow
 def test_both_move_alike_when_a_constant_is_considered(solved):
     chain, _ = solved
     constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
@@ -337,6 +339,7 @@ def smoothed_without_gtsam(folder: Path, log: str) -> subprocess.CompletedProces
     return subprocess.run([str(a) for a in command], capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_a_dive_without_places_is_smoothed_where_gtsam_is_missing(recorded):
     done = smoothed_without_gtsam(recorded, "log.csv")
     assert done.returncode == 0, done.stderr[-1000:]

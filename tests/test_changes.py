@@ -112,6 +112,7 @@ def over_a_moving_bed(case: Simulated, velocity_n: tuple[float, float]) -> Log:
     return altered(case.log, "dvl", data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_n", [(0.2, -0.25), (0.05, 0.05)])
 def test_a_bed_that_moves_is_found_where_fixes_show_it_and_they_are_believed(case, velocity_n):
     """All the time: before it is found, every fix is rejected."""

@@ -144,6 +144,7 @@ def test_a_gap_is_found_where_it_is_and_a_long_one_of_the_imu_is_refused(sound):
     assert "imu.max_gap_s = 30" in messages(cut(sound, "imu", 100, 140), level="error")
 
 
+@pytest.mark.slow
 def test_milliseconds_taken_for_seconds_are_noticed(sound):
     slow = {k: replace(s, time=s.time * 1000) for k, s in sound.streams.items()}
     assert "units: {time: ms}" in messages(replace(sound, streams=slow), sensor="imu")
@@ -527,6 +528,7 @@ def test_spikes_of_the_depth_say_nothing_of_the_dvl(sound):
     assert "vertical velocity agrees with the change of depth (slope 1" in messages(spikes, level="ok")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", [1.0, -8.0])
 def test_a_depth_that_is_zeroed_under_way_does_not_blame_the_dvl(sound, by):
     def zero(data, time):
@@ -580,6 +582,7 @@ def test_warn_issues_what_examine_finds(sound):
         warn(scaled(sound, "depth", slice(0, 1), -1.0))
 
 
+@pytest.mark.slow
 def test_sparse_streams_do_not_break_any_check(sound):
     for sensor in sound.sensors:
         for n in (1, 2, 20):

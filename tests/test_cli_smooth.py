@@ -200,6 +200,7 @@ def test_duplicated_rows_warn_and_change_nothing(monkeypatch, capsys, tmp_path, 
     np.testing.assert_allclose(a["north"], b["north"], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["acc_x", "gyr_z", "mag_y", "dvl_vx", "dvl_heading", "depth"])
 def test_nan_and_inf_in_any_column_warn_and_the_track_stays(monkeypatch, capsys, tmp_path, short, config, column):
     frame = short.copy()
@@ -367,6 +368,7 @@ def test_the_real_dive_meets_its_targets(tmp_path, monkeypatch):
     assert abs(yaw["value"] + 21.8) <= 2.0 * yaw["sd"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [{"delay_s": {"fix": 2}}, {"online": {"delay_s": {"fix": 2}}}])
 def test_fixes_that_are_late_by_a_known_time_give_the_track_of_punctual_ones(monkeypatch, tmp_path, stated):
     case = simulated(falcon(), 45.0, seed=2, fix_interval=2.0)

@@ -171,6 +171,7 @@ def test_estimators_share_the_stages_they_have_in_common(recorded):
     assert all(o.seconds >= 0.02 for o in done)
 
 
+@pytest.mark.slow
 def test_filters_of_several_dives_go_side_by_side_and_share_the_time(recorded):
     lacking = ChainTask(without(recorded.log, "mag"), recorded.config)
     short = ChainTask(kept(recorded.log, "imu", recorded.log["imu"].time < 10.0), recorded.config)
@@ -428,6 +429,7 @@ def test_an_interrupt_that_another_thread_takes_waits_until_processes_have_start
     assert through
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes by /proc")
 def test_an_interrupt_ends_all_workers_and_leaves_nothing(tmp_path):
     script = "from rovgraph.cli.app import main\nif __name__ == '__main__':\n    main()\n"

@@ -142,6 +142,7 @@ def test_the_site_is_built_without_a_warning_and_its_search_needs_no_network(tmp
 # commands
 
 
+@pytest.mark.slow
 def test_the_command_line_knows_every_command_of_the_manuals():
     found = [(page.name, text) for page in PAGES for text in commands(page)]
     wrong = []
@@ -310,6 +311,7 @@ def drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     plt.switch_backend(backend)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
 def test_an_example_says_what_it_promises_and_draws_its_figure(path, remembered, drawing, monkeypatch, capsys):
     known = set(SENSORS)

@@ -203,6 +203,7 @@ def test_two_adjacent_beams_carry_a_dive_whose_velocities_are_lost(case):
     assert (np.abs(p - truth)[:2] < 3.0 * sd[:2]).all()
 
 
+@pytest.mark.slow
 def test_filter_smoother_and_isam2_take_beams_alike(case):
     log, config = dive(case, without_fore(15.0, 30.0))
     estimates = {e.kind: e.trajectory.p_n[-1] for e in smooth(log, config, "both").estimates}

@@ -91,6 +91,7 @@ def files(dive, tmp_path) -> list[Path]:
     return [tmp_path / "auto.csv", tmp_path / "dvl.jsonl"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.parquet"])
 def test_converted_beams_lie_beside_the_log_and_are_read_with_it(files, tmp_path, name):
     out = tmp_path / "out"
@@ -124,6 +125,7 @@ def _points(start: float) -> str:
     return "".join(f'<trkpt lat="{50 + 1e-5 * k}" lon="8"><time>{t}</time></trkpt>' for k, t in enumerate(stamps))
 
 
+@pytest.mark.slow
 def test_a_known_latency_of_the_dvl_is_that_of_its_beams(files, tmp_path):
     config = rg.parse_config("{delay_s: {dvl: 0.25}}")
     log = rg.read_log(files, config)
@@ -151,6 +153,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("content", "said"), HOSTILE.values(), ids=HOSTILE.keys())
 def test_beams_that_cannot_be_used_are_left_out_with_one_warning(files, tmp_path, content, said):
     rg.convert(files).save(tmp_path / "log.csv")

@@ -95,6 +95,7 @@ def test_samples_are_averages_over_their_period(lively):
         assert np.abs(average[0] - lively.felt(middle, arm)[0][0]).max() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.5, -0.3, 0.2)])
 def test_a_strapdown_with_perfect_samples_returns_to_the_truth(lively, arm):
     end, truth = returned(lively, 40.0, np.array(arm))
@@ -147,6 +148,7 @@ def test_every_fault_has_a_healthy_case_and_words_that_name_it():
         assert not re.search(case.says, "assumed: heading from ahrs", re.IGNORECASE) or "heading" in case.says
 
 
+@pytest.mark.slow
 def test_every_fault_of_a_log_changes_it():
     logs = {}
     for scenario in ("dives", "brisk turns"):
@@ -235,6 +237,7 @@ def sds_that_show(grade, velocity, dt=0.2):
     return np.sqrt(total)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "grade", "least", "most"),
     [
@@ -526,6 +529,7 @@ def test_perfect_instruments_give_the_true_track():
     assert result.rms["filtered"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_dvls_arm_that_is_off_is_named_and_used_not_taken_for_an_error_that_lasts():
     result = run_case(CASES["dvl arm"], 0)
     told = [text for text in result.said if "calibration.dvl" in text]

@@ -139,6 +139,7 @@ def test_the_guess_of_a_foreign_table_is_the_truth(form: Callable, frame, tmp_pa
     assert guess.config.columns == guess.mapping and guess.config.units == guess.units
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.filterwarnings("ignore::rovgraph.errors.DataWarning")
 def test_smoothing_with_the_proposed_configuration_gives_the_track_of_the_log(form: Callable, dive, frame, tmp_path):
@@ -368,6 +369,7 @@ NAMES = st.sampled_from(
 CELLS = st.one_of(st.floats(), st.integers(), st.just(""), st.text(max_size=5), st.floats(-10, 10))
 
 
+@pytest.mark.slow
 @given(data=st.data())
 def test_random_tables_are_guessed_or_refused_in_one_line(tmp_path_factory, data):
     names = data.draw(st.lists(st.one_of(NAMES, st.text(max_size=8)), min_size=1, max_size=9, unique=True))

@@ -334,6 +334,7 @@ def files(dive, tmp_path, toy) -> list[Path]:
     return [log, dvl]
 
 
+@pytest.mark.slow
 def test_a_dive_in_two_files_comes_back_to_the_same_track(files, dive):
     config = changed(falcon(), graph={"find_noise": False})
     whole = rg.smooth(rg.Log.from_frame(dive.drop(columns="dvl_heading", errors="ignore"), config), config, "smoothed")
@@ -353,6 +354,7 @@ def test_a_dive_in_two_files_comes_back_to_the_same_track(files, dive):
     assert abs(result.calibration["dvl_time_offset"].value) < 0.05
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_the_library_does_and_smooth_reads_it_the_same(files, tmp_path, monkeypatch, capsys):
     out, mine = tmp_path / "log.csv", tmp_path / "mine"
     assert command(monkeypatch, "convert", *files, "--out", out, "--config-out", tmp_path / "v.yaml") == 0
@@ -562,6 +564,7 @@ def test_a_choice_names_a_file_or_what_one_of_several_files_has(boxes, choice):
     assert converted.report["columns"]["acc_x"].startswith("box.BIN: IMU 0")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="what a process holds is read from /proc")
 def test_a_log_of_one_message_that_does_not_fit_into_memory_is_refused_and_not_called_damaged(tmp_path):
     path, out = tmp_path / "long.BIN", tmp_path / "log.csv"

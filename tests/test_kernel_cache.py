@@ -32,6 +32,7 @@ def own_kernel(folder: Path, **environment: str) -> subprocess.CompletedProcess[
     return run(f"import sys; sys.path.insert(0, {str(folder)!r}); import own_kernel", **environment)
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_once_and_said_to_be_once(tmp_path):
     kept = tmp_path / "kept"
     first, second = (own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(kept)) for _ in range(2))
@@ -63,6 +64,7 @@ def test_where_no_folder_can_be_written_kernels_are_compiled_all_the_same(tmp_pa
     assert "set ROVGRAPH_CACHE_DIR" in done.stderr
 
 
+@pytest.mark.slow
 def test_processes_that_compile_at_once_do_not_disturb_each_other(tmp_path):
     (tmp_path / "own_kernel.py").write_text(MODULE)
     given = {
@@ -187,6 +189,7 @@ def test_modules_with_kernels_are_those_that_decorate_one():
     assert {"chain", "weighting", "filtering"} < names and not {"compile", "rotations"} & names
 
 
+@pytest.mark.slow
 def test_a_folder_that_an_interrupt_left_empty_is_compiled_again_and_said_to_be(tmp_path):
     kept = tmp_path / "kept"
     first = own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(kept))
@@ -238,6 +241,7 @@ print(twice(Pair(np.ones(3), np.full(3, 2.0)), product))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", RENAMED)
 def test_a_numba_that_does_not_take_our_compilers_compiles_in_its_own_way_and_says_so_once(changed, tmp_path):
     (tmp_path / "own_kernel.py").write_text(IN_NUMBAS_WAY)
@@ -250,6 +254,7 @@ def test_a_numba_that_does_not_take_our_compilers_compiles_in_its_own_way_and_sa
     assert list((tmp_path / "kept").rglob("*.nbc"))
 
 
+@pytest.mark.slow
 def test_a_numba_that_takes_our_compilers_is_tried_once(tmp_path):
     (tmp_path / "own_kernel.py").write_text(IN_NUMBAS_WAY)
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"

@@ -257,6 +257,7 @@ def test_weight_is_the_slope_of_the_robust_cost(loss):
     assert (weight[-1] < 0.5) == (LOSSES[loss] != "none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["test_kernel_measurements.py", "test_kernel_error_coordinates.py"])
 def test_kernels_hold_uncompiled_too(file):
     if os.environ.get("NUMBA_DISABLE_JIT") == "1":

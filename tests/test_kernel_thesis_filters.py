@@ -120,6 +120,7 @@ def test_a_covariance_that_is_none_ends_that_filter_alone():
         assert (ours[[0, 2]] == expected[[0, 2]]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="this is that run")
 def test_as_plain_python_too():
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

@@ -110,6 +110,7 @@ def test_what_the_smoothed_dive_shows_is_said_with_its_newest_figures_and_unless
         assert newest == said[-1:]
 
 
+@pytest.mark.slow
 def test_a_dive_whose_constants_are_off_by_what_is_believed_of_them_is_trusted():
     dive, config = named("falcon", 1, None, Choices(disturbances=False))
     log = Log.from_frame(dive.between(0.0, dive.log_frame["time"].iloc[0] + 250.0).log_frame)

@@ -231,6 +231,7 @@ def dropped(stderr: bytes) -> int:
     return int(count)
 
 
+@pytest.mark.slow
 def test_standard_output_has_every_line_where_its_reader_reads():
     child = prints(100, "live")
     out, err = child.communicate(timeout=30)
@@ -238,6 +239,7 @@ def test_standard_output_has_every_line_where_its_reader_reads():
     assert dropped(err) == 0
 
 
+@pytest.mark.slow
 def test_a_reader_of_standard_output_that_does_not_read_holds_up_nothing():
     """Neither sending nor the end of the program: each would wait for ever."""
     child = prints(3000, "live")
@@ -248,6 +250,7 @@ def test_a_reader_of_standard_output_that_does_not_read_holds_up_nothing():
     assert len(lines) - 1 <= 3000 - dropped(err) <= len(lines) + 1
 
 
+@pytest.mark.slow
 def test_a_patient_output_waits_for_its_reader_and_loses_nothing():
     child = prints(3000, "patient")
     time.sleep(1.0)

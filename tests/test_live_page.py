@@ -717,6 +717,7 @@ START = b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\n"
 HEAD = b"POST /api/marks HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("said", [b"", START], ids=["silent", "half"])
 def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, said):
     monkeypatch.setattr(broadcast, "REQUEST_S", 4.0)

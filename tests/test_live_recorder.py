@@ -146,6 +146,7 @@ for k in itertools.count():
 """
 
 
+@pytest.mark.slow
 def test_a_kill_loses_only_what_was_not_yet_handed_over_and_the_recording_goes_on(tmp_path):
     path = tmp_path / "r.csv"
     child = subprocess.Popen([sys.executable, "-c", CRASHES, path], stdout=subprocess.PIPE, text=True)
@@ -233,6 +234,7 @@ def full_disk(*arguments) -> tuple[list[list[str]], int, int]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_complained_of_once_and_nothing_is_lost_when_there_is_space_again(tmp_path):
     said, full, lost = full_disk(tmp_path / "r.csv", "free")
     assert [kind for _, kind, _ in said] == ["disk"]
@@ -241,6 +243,7 @@ def test_a_full_disk_is_complained_of_once_and_nothing_is_lost_when_there_is_spa
     assert read_quietly(tmp_path / "r.csv")["imu"].time.tolist() == list(range(1000))
 
 
+@pytest.mark.slow
 def test_a_disk_that_stays_full_keeps_what_it_took_and_the_loss_is_counted(tmp_path):
     said, _, lost = full_disk(tmp_path / "r.csv")
     assert [kind for _, kind, _ in said] == ["disk", "lost"]
@@ -363,6 +366,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_kill_while_checkpoints_are_written_leaves_a_whole_one(tmp_path):
     for _ in range(3):
         child = subprocess.Popen([sys.executable, "-c", CHECKPOINTS, tmp_path / "a"], stdout=subprocess.PIPE, text=True)

@@ -1065,6 +1065,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_a_program():
     code = INTERRUPTED.format(udp=free_port(), tcp=free_port())
     with subprocess.Popen(

@@ -89,6 +89,7 @@ def test_a_telemetry_log_and_a_recording_of_blueos(written: Callable[..., bytes]
     assert rms(np.linalg.norm(apart, axis=1)) < 0.02  # attitude is stamped in whole milliseconds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ROS_FORMS)
 def test_a_ros_bag(form, tmp_path):
     frame = sensors("acc", "gyr", "mag", "depth", "dvl")
@@ -97,6 +98,7 @@ def test_a_ros_bag(form, tmp_path):
     assert rms(np.linalg.norm(apart, axis=1)) < 0.001
 
 
+@pytest.mark.slow
 def test_a_ros_bag_is_converted_with_the_mountings_of_its_transforms_and_smoothed(tmp_path, monkeypatch):
     """By commands: the bag to a log and a configuration, and these to results."""
     frame = sensors("acc", "gyr", "mag", "depth", "dvl")

@@ -255,6 +255,7 @@ def test_without_depth_the_vertical_is_as_uncertain_as_the_start(dive):
     assert np.sqrt(track.cov_p[-1, 2, 2]) > 50.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["mirrored", "reversed"])
 def test_a_wrong_heading_is_loud_where_a_few_fixes_show_the_way(dive, wrong):
     case, config = dive

@@ -177,6 +177,7 @@ class Reader:
         return b"".join(self._said)
 
 
+@pytest.mark.slow
 def test_a_dvl_an_imu_and_an_autopilot_with_clocks_of_their_own(case, tmp_path):
     pings, samples, autopilot = [], [], []
     for m in case.log.measurements():
@@ -213,6 +214,7 @@ def test_a_dvl_an_imu_and_an_autopilot_with_clocks_of_their_own(case, tmp_path):
     assert solutions[-1]["latency_s"] is not None
 
 
+@pytest.mark.slow
 def test_bad_input_is_counted_and_said_once_and_the_estimate_goes_on(lines, case, tmp_path):
     out, config = tmp_path / "out", tmp_path / "config.yaml"
     config.write_text(case.config.to_yaml())

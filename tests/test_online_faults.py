@@ -341,6 +341,7 @@ def test_thruster_lines_that_change_their_count_are_left_out_and_the_estimate_be
     assert nav.left_out["thruster", "2 signals, and 1 before"] > 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [False, True])
 def test_water_track_is_used_whenever_it_begins_and_carries_the_filter_where_the_bottom_is_lost(late):
     case = simulated(falcon(), 60.0, seed=1, dvl_rate=4.0, water_track=True)

@@ -88,6 +88,7 @@ WRITERS: dict[str, tuple[Callable[[Path, pd.DataFrame, str], Path], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [0.0, 1.0], ids=["end to end", "a second twice"])
 @pytest.mark.parametrize("form", WRITERS)
 def test_pieces_in_any_order_are_what_the_whole_is(dive, tmp_path, form, overlap):

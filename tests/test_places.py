@@ -186,6 +186,7 @@ def test_places_bring_back_what_was_lost_without_the_bottom(lost):
     assert np.mean(normalised) < chi2.ppf(0.99, 2)
 
 
+@pytest.mark.slow
 def test_isam2_agrees_with_the_batch_solution(lost):
     one, other = batch(lost.log, lost.config).solve(), incremental(lost.log, lost.config).solve()
     np.testing.assert_allclose(one.trajectory.p_n, other.trajectory.p_n, atol=0.02)

@@ -142,6 +142,7 @@ def moved_by_noise(offset: float, estimate: bool | str = "considered") -> DiveEs
     return smooth(case.log, started(case))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimate", ["considered", True])
 def test_a_dvl_that_is_elsewhere_is_found_said_and_used(estimate):
     dive = moved_by_noise(0.2, estimate)

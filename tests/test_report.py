@@ -539,6 +539,7 @@ def png_size(path):
 FIGURES = ["track.png", "velocity.png", "attitude.png", "depth.png", "residuals.png", "calibration.png"]
 
 
+@pytest.mark.slow
 def test_figures_exist_with_sane_sizes(dive, tmp_path):
     from rovgraph.report.figures import draw_figures
 
@@ -552,6 +553,7 @@ def test_figures_exist_with_sane_sizes(dive, tmp_path):
         assert width == 1080 and 500 < height < 2500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("form", "begin"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_figures_as_vectors_are_equal_files_in_each_run(form, begin, dive, tmp_path):
     from rovgraph.report.figures import draw_figures
@@ -615,6 +617,7 @@ def test_depth_grows_downwards_and_the_bottom_lies_below_it_by_the_altitude(dive
     assert len(draw_depth(estimates, log, config).axes) == 1
 
 
+@pytest.mark.slow
 def test_figures_leave_matplotlib_as_it_was(dive, tmp_path):
     import matplotlib
 

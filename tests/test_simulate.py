@@ -213,6 +213,7 @@ def test_sensor_noise_has_the_configured_sd(config, rough, sensor, columns):
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=5.0 / np.sqrt(n))
 
 
+@pytest.mark.slow
 def test_bias_walks_with_the_configured_variance():
     text = "imu: {noise: {acc_walk: 1.0e-3, gyr_walk: 1.0e-5}}"
     path = scenario("straight", 36.0)
@@ -249,6 +250,7 @@ def test_only_calibration_that_is_uncertain_is_drawn_and_from_its_prior():
     np.testing.assert_allclose([d["dvl_pitch"][0] for d in draws], np.deg2rad(1.0))
 
 
+@pytest.mark.slow
 def test_start_error_is_drawn_from_the_starts_sd():
     config = parse_config("start: {position_sd_m: 2.0}")
     path = scenario("straight", 36.0)

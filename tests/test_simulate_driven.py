@@ -280,6 +280,7 @@ def test_what_cannot_be_is_refused(name, keys, words):
         simulated(name, 1, choices=Choices(**keys))
 
 
+@pytest.mark.slow
 def test_chosen_duration_changes_the_speed_and_chosen_speed_the_duration():
     slow = simulated("docking", 1, choices=Choices(duration=300.0))[0]
     fast = simulated("docking", 1, choices=Choices(speed=0.5))[0]
@@ -288,6 +289,7 @@ def test_chosen_duration_changes_the_speed_and_chosen_speed_the_duration():
     assert highest[0] < 0.35 and highest[1] > 0.45
 
 
+@pytest.mark.slow
 def test_a_vehicle_without_enough_thrusters_says_so():
     weak = CONFIG.model_copy(update={"vehicle": CONFIG.vehicle.model_copy(update={"thrust": (0.01, 0.0, 0.0)})})
     with pytest.raises(InputError, match="not reached"):

@@ -167,6 +167,7 @@ def test_memory_of_a_conversion_grows_by_less_than_a_stamp_for_each_row(tmp_path
     assert most[1] - most[0] < 8 * 6_000_000
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize(
     "before",

@@ -164,6 +164,7 @@ out.close()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 def test_on_a_real_terminal_it_draws_there_and_standard_output_has_only_json():
     ours, theirs = pty.openpty()

@@ -55,6 +55,7 @@ def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
     assert abs(stretch.end - begin - BIASED_S) < 3.0
 
 
+@pytest.mark.slow
 def test_a_tilt_of_the_dvl_does_not_widen_the_stretch_of_its_bias():
     """Seed 5 draws a DVL that is tilted by 3.8 and 3.2 degrees, which the priors allow: all its pings cost more."""
     config = rg.Config().changed(heading={"sources": ["dvl"]})

@@ -81,6 +81,7 @@ def test_fixes_whose_errors_last_are_found_and_believed_so(correlated, found):
         assert nees(correlated[0], found, kind) < 2.0, kind
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lasts", [True, False])
 def test_an_estimate_that_goes_on_without_it_raises_an_alarm_with_the_keys_that_state_it(correlated, lasts):
     case, config = correlated if lasts else with_fixes(seed=3)
@@ -100,6 +101,7 @@ def test_an_estimate_that_goes_on_without_it_raises_an_alarm_with_the_keys_that_
         assert stated.fix.sd_m == pytest.approx(one.beliefs.noise["fix"] * config.fix.sd_m, rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_the_configuration_says_of_an_error_stands(correlated):
     """And without the search the track is a lie, so the test above can fail."""
     case, config = correlated
@@ -111,6 +113,7 @@ def test_what_the_configuration_says_of_an_error_stands(correlated):
         assert not found or dive.verdict != "trusted"  # another cause was taken for it, which the verdict says
 
 
+@pytest.mark.slow
 def test_a_default_that_is_written_out_means_the_same():
     """The start from the first fix, and errors that last from the dive: to the last bit."""
     case, config = with_fixes(seed=5, fix_error=ERROR)
