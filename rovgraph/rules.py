@@ -180,7 +180,12 @@ _ROWS = (
         25.0,
         rate=4e-4,
     ),
-    Rule("found", "how far what was found in the dive moved the track, rms, in sds of the track", 2.0, rate=0.01),
+    Rule(
+        "found",
+        "how far what was found in the dive moved the track, rms, in its sds before or after, the larger",
+        2.0,
+        rate=0.01,
+    ),
     Rule("rivals", "how far apart clear explanations put the track, rms, in its sds", 2.0, rate=1e-3),
     Rule("left out", "share of a sensor's measurements that never reached the estimate", 0.1, 0.5, rate=1e-3),
     Rule(

@@ -393,6 +393,14 @@ def test_found_is_the_rms_by_which_the_track_moved_in_its_sds(limit, times, seve
     assert span_of(one) == (200.0, 200.0)
 
 
+def test_a_move_for_which_the_sd_had_room_before_is_no_evidence_of_error():
+    t, wide = track(sd=1.0), track(sd=4.0)
+    off = np.full(len(t), 4.0 * sqrt(2.0))
+    for before, figure in ((wide, 1.0), (t, 4.0)):
+        (one,) = motion.found_noise(evidence(t=t, before=moved_by(before, 1, off), revealed=[("dvl", "its scale")]))
+        assert one.figure == pytest.approx(figure)
+
+
 @lower
 def test_rivals_are_as_far_apart_as_their_tracks_rms(limit, times, severity):
     figure, t = figure_of("rivals", limit, times), track(sd=2.0)

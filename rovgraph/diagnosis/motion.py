@@ -137,11 +137,15 @@ def rms_of(values: Array) -> float:
 
 
 def found_noise(evidence: Evidence) -> Iterator[Statistic]:
-    """How far what was found in the dive has moved its track: noise that matters to nothing is no evidence of error."""
+    """How far what was found in the dive has moved its track: noise that matters to nothing is no evidence of error.
+
+    Nor is a move that the sd before had room for, as it has for a considered constant that the dive shows.
+    """
     track, before = evidence.main.trajectory, evidence.before
     if before is None or len(before) != len(track):
         return
-    square = _squares(before, track, track.cov_p, track.cov_theta[:, 2, 2])["position"]
+    squares = [_squares(before, track, t.cov_p, t.cov_theta[:, 2, 2])["position"] for t in (track, before)]
+    square = min(squares, key=np.mean)
     apart = np.linalg.norm((before.p_n - track.p_n)[:, :2], axis=1)
     k, moved = int(np.argmax(apart)), rms_of(np.sqrt(square))
     for sensor, cause in evidence.revealed:
