@@ -4,8 +4,9 @@
     python benchmarks/acoustics.py --rows "one beacon" --seeds 3 --online
 
 prints a table in Markdown: horizontal rms error and stated sd, and NEES of position, depth and heading, of the
-smoothed, filtered and online estimates. Dives go through the command line. Each dive draws its constants from the
-priors that its configuration states (`PRIORS`), but for what a row's name says.
+smoothed, filtered and online estimates, and how far constants are found from what they are. Dives go through the
+command line. Each dive draws its constants from the priors that its configuration states (`PRIORS`), but for what a
+row's name says.
 """
 
 import argparse
@@ -149,7 +150,12 @@ def below_ship(setting: Setting, seed: int) -> Dive:
     if setting.changed is not None:
         replies = setting.changed(replies, rng)
     streams |= {"usbl": replies} | ship.says(setting.seconds, rng)
-    return Dive(streams, merge(config, setting.config), motion, hidden)
+    others = {
+        "usbl_yaw": lever[2] - ship.heading_error,
+        "usbl_time_offset": setting.latency,
+        "sound_speed_scale": np.nan if setting.profile else system.sound_speed / system.believed_speed - 1.0,
+    }
+    return Dive(streams, merge(config, setting.config), motion, replace(hidden, others=others))
 
 
 def spoil(replies: pd.DataFrame, share: float, rng: np.random.Generator) -> None:
@@ -209,6 +215,9 @@ def among_beacons(
     vehicle, system = draw(vehicle, system, rng)
     streams, hidden = sample(motion, vehicle, rng)
     streams["range"] = ranges(motion, places, system, rng)
+    if surveyed is None:
+        others = {f"beacon_1_{axis}": float(at) for axis, at in zip(("north", "east"), places["1"], strict=False)}
+        hidden = replace(hidden, others=others)
     if lost:
         pings = streams["dvl"]
         streams["dvl"] = pings[(pings["time"] < 300.0) | (pings["time"] > 300.0 + lost)]
@@ -310,12 +319,31 @@ ROWS: dict[str, Callable[[int], Dive]] = {
 
 def run_row(name: str, seed: int, online: bool) -> Result:
     """One dive."""
-    return run_dive(ROWS[name](seed), online)
+    return run_dive(ROWS[name](seed), online, inspect)
+
+
+def inspect(folder: Path, dive: Dive) -> dict[str, float]:
+    """How far constants are found from what they are, and their sd, as calibration.csv has them."""
+    table = pd.read_csv(folder / "out/calibration.csv")
+    smoothed = table[table["estimate"] == "smoothed"].set_index("label")
+    found = {}
+    for label, true in dive.hidden.others.items():
+        if label in smoothed.index and np.isfinite(true):
+            found |= {f"{label} off": smoothed.loc[label, "value"] - true, f"{label} sd": smoothed.loc[label, "sd"]}
+    return found
 
 
 def figures(name: str, results: Sequence[Result]) -> str:
     """A row of the table."""
-    return "| " + " | ".join([name, *estimate_cells(results)]) + " |"
+    labels = dict.fromkeys(key.removesuffix(" off") for r in results for key in r.found if key.endswith(" off"))
+    found = []
+    for label in labels:
+        off, sd = (
+            np.sqrt(np.mean([r.found[f"{label} {what}"] ** 2 for r in results if f"{label} {what}" in r.found]))
+            for what in ("off", "sd")
+        )
+        found.append(f"{label} {off:.2g} ({sd:.2g})")
+    return "| " + " | ".join([name, *estimate_cells(results), ", ".join(found) or "–"]) + " |"
 
 
 def main() -> None:
@@ -329,8 +357,8 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
     arguments = parser.parse_args()
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
-    print("| dive | " + " | ".join(heads) + " | verdicts |")
-    print("|---" * (len(heads) + 2) + "|", flush=True)
+    print("| dive | " + " | ".join(heads) + " | verdicts | constants off (sd) |")
+    print("|---" * (len(heads) + 3) + "|", flush=True)
     with workers(arguments.jobs) as pool:
         for name in arguments.rows:
             with starting():

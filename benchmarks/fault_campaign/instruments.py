@@ -3,7 +3,7 @@
 A stream is a table with a column ``time`` and the columns of docs/log-format.md.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -19,10 +19,11 @@ XYZ = ("x", "y", "z")
 
 @dataclass
 class Hidden:
-    """What an estimator is to find: the DVL's yaw [deg] and scale."""
+    """What an estimator is to find: the DVL's yaw [deg] and scale, and other components of the calibration by label."""
 
     dvl_yaw: float
     dvl_scale: float
+    others: dict[str, float] = field(default_factory=dict)
 
 
 def _times(motion: Motion, rate: float, offset: float) -> Array:
