@@ -36,6 +36,7 @@ from rovgraph.log.frozen import CLEAR_SPEED
 from rovgraph.log.reading import water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
+from rovgraph.model.config_sections import Environment
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
@@ -556,7 +557,7 @@ def _thrusters(log: Log, config: Config, expected: Collection[str]) -> list[str]
 
 
 def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Config:
-    """Fill in the field's magnitude and dip, and the latitude."""
+    """Fill in the field's magnitude and dip, the latitude, and gravity."""
     env, changes = config.environment, {}
     if "mag" in log and "mag" in heading_sources(config, log.sensors):
         mag = log["mag"].data
@@ -579,7 +580,25 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
         raise InputError(
             "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
         )
-    return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
+    env = env.model_copy(update=changes)
+    if env.gravity_mps2 is None:
+        env = env.model_copy(update={"gravity_mps2": _gravity(log, config, env, assumptions)})
+    return config.model_copy(update={"environment": env})
+
+
+def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str]) -> float:
+    """Gravity by latitude and by the depth at the start, which holds for the dive [m/s^2]."""
+    if env.latitude is None or has_constant_velocity(config):
+        return env.gravity
+    depth = config.start.down_m
+    if depth is None:
+        depth = float(np.median(log["depth"].data[:9, 0])) if "depth" in log else 0.0
+    gravity = float(env.gravity_at(depth))
+    assumptions.append(
+        f"environment.gravity_mps2 {gravity:.4f}, normal gravity at latitude {env.latitude:.1f} and a depth of "
+        f"{depth:.0f} m"
+    )
+    return gravity
 
 
 def sample_density(time: Array, samples: Array) -> float:
