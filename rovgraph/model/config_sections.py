@@ -298,6 +298,15 @@ class TiltSettings(ConfigSection):
 class Depth(ConfigSection):
     """Pressure sensor."""
 
+    source: Literal["depth", "pressure"] = Field(
+        "depth", description="column that depths come from where a log has both; else the one that it has"
+    )
+    surface_hpa: NotNegative | None = Field(
+        None, description="air pressure at the surface [hPa], 0 = taken off already; null = found at the surface"
+    )
+    density_kgm3: Annotated[float, Field(ge=900, le=1300)] | None = Field(
+        None, description="density of the water [kg/m3], for depth by pressure; null = by sound.salinity_psu, else 1025"
+    )
     sd_m: Positive = Field(0.05, description="noise of a depth sample")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
