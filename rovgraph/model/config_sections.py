@@ -83,7 +83,11 @@ class Environment(ConfigSection):
     latitude_deg: Latitude | None = Field(
         None, description="latitude, for gravity and Earth rotation; null = of the origin"
     )
-    declination_deg: float = Field(0.0, description="magnetic declination, east positive")
+    declination_deg: float = Field(
+        0.0,
+        description="magnetic declination, east positive; not given = by place and date for a magnetometer that is the "
+        "only compass, else 0",
+    )
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
     )
