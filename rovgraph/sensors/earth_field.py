@@ -37,7 +37,7 @@ class EarthField(NamedTuple):
 
 @cache
 def _model() -> Any:
-    from pygeomag import GeoMag  # reads its coefficients
+    from pygeomag.geomag import GeoMag  # reads its coefficients
 
     return GeoMag(coefficients_file="wmm/WMM_2025.COF")
 
