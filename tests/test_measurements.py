@@ -272,7 +272,7 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     assert set(problem.used) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor in problem.used:
         instrument = smoother.initial.instruments[sensor]
-        gravity, unknowns = config.environment.gravity_mps2, CalibrationRoles(truth.calibration, {})
+        gravity, unknowns = config.environment.gravity, CalibrationRoles(truth.calibration, {})
         block = Measurements(problem, problem.of_sensor(sensor), instrument, gravity, unknowns)
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little

@@ -136,7 +136,7 @@ def still_heading(on: bool) -> float:
     lat = np.deg2rad(LATITUDE)
     config = Config.model_validate({"environment": {"earth_rotation": on, "latitude_deg": LATITUDE}})
     time = np.arange(0.0, STILL_S + 0.1, 0.1)
-    signal = np.concatenate([[0, 0, -config.environment.gravity_mps2], earth_rate_n(lat)])
+    signal = np.concatenate([[0, 0, -config.environment.gravity], earth_rate_n(lat)])
     imu = np.column_stack([time, np.tile(signal, (len(time), 1))])
     state = State(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)))
     params = preintegration_params(config)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import (
     Array,
@@ -36,6 +37,7 @@ from rovgraph.log.frozen import CLEAR_SPEED
 from rovgraph.log.reading import water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
+from rovgraph.model.config_sections import Environment
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
@@ -44,6 +46,7 @@ from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, m
 from rovgraph.sensors import SENSORS, innovation
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import SoundCorrection
+from rovgraph.sensors.earth_field import BLACKOUT_NT, EarthField, decimal_year, earth_field
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
@@ -556,7 +559,7 @@ def _thrusters(log: Log, config: Config, expected: Collection[str]) -> list[str]
 
 
 def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Config:
-    """Fill in the field's magnitude and dip, and the latitude."""
+    """Fill in the field's magnitude and dip, the latitude, and gravity."""
     env, changes = config.environment, {}
     if "mag" in log and "mag" in heading_sources(config, log.sensors):
         mag = log["mag"].data
@@ -573,13 +576,48 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             if not beliefs(config)["field_dip"].estimate:
                 hint = "give it, or estimate calibration.field_dip"
                 assumptions[-1] += f", and held, with the error of the levelling in it: {hint}"
+    if (field := field_by_place(log, config)) is not None and field.horizontal_nt > BLACKOUT_NT:
+        changes["declination_deg"] = round(field.declination_deg, 2)
+        assumptions.append(
+            f"environment.declination_deg {field.declination_deg:.2f} within {field.declination_sd_deg:.1f} deg, by "
+            f"WMM2025 at the origin and the date of the log{', which the model does not reach' * field.expired}"
+        )
     if env.latitude_deg is None and log.origin is not None:
         changes["latitude_deg"] = log.origin[0]
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
         raise InputError(
             "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
         )
-    return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
+    env = env.model_copy(update=changes)
+    if env.gravity_mps2 is None:
+        env = env.model_copy(update={"gravity_mps2": _gravity(log, config, env, assumptions)})
+    return config.model_copy(update={"environment": env})
+
+
+def field_by_place(log: Log, config: Config) -> EarthField | None:
+    """The Earth's field where a dive begins, if its only compass is a magnetometer and no declination is stated.
+
+    None where it is stated, the log knows no place or date, or another compass may be relative to true north.
+    """
+    stated = "declination_deg" in config.environment.model_fields_set
+    if stated or log.origin is None or heading_sources(config, log.sensors) != ["mag"] or not is_unix(log.start):
+        return None
+    return earth_field(*log.origin, 0.0, decimal_year(log.start))
+
+
+def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str]) -> float:
+    """Gravity by latitude and by the depth at the start, which holds for the dive [m/s^2]."""
+    if env.latitude is None or has_constant_velocity(config):
+        return env.gravity
+    depth = config.start.down_m
+    if depth is None:
+        depth = float(np.median(log["depth"].data[:9, 0])) if "depth" in log else 0.0
+    gravity = float(env.gravity_at(depth))
+    assumptions.append(
+        f"environment.gravity_mps2 {gravity:.4f}, normal gravity at latitude {env.latitude:.1f} and a depth of "
+        f"{depth:.0f} m"
+    )
+    return gravity
 
 
 def sample_density(time: Array, samples: Array) -> float:

@@ -520,7 +520,12 @@ class Files:
                 return None
         if self.replayed or self.state is None:
             # recorded under rovgraph's own names, in SI
-            return replace(read_log(path, Config(environment=self.config.environment)), config=None)
+            return replace(
+                read_log(
+                    path, Config(environment=self.config.environment, depth=self.config.depth, sound=self.config.sound)
+                ),
+                config=None,
+            )
         return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))
 
     def note(self, events: Iterable[Event]) -> None:

@@ -28,8 +28,9 @@ from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.pressure import DepthByPressure
 
-_STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship"}  # where a reading goes by another name
+_STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship", "pressure": "depth"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
 
@@ -86,6 +87,8 @@ class Intake:
         self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._sound, self._water = SoundCorrection(config), np.full(3, np.nan)  # in the order of `WaterState`
+        self.pressure = DepthByPressure(config)
+        self._depth_source, self._depths_by = config.depth.source, ""  # the column that is used, as far as it came
         self._left_out = left_out
         self._newest: dict[tuple[str | float, ...], float] = {}  # by sensor, and beacon or place
         self._name_columns: dict[str, list[int]] = {}  # of each sensor
@@ -107,6 +110,10 @@ class Intake:
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard at that time."""
         sensor, values = reading
+        if sensor in ("depth", "pressure"):
+            if (below := self._depth(time, sensor, float(values[0]))) is None:
+                return None
+            sensor, values = "depth", np.array([below])
         if sensor in ON_EARTH:
             if self.origin is None:
                 self.origin = float(values[0]), float(values[1])
@@ -118,8 +125,10 @@ class Intake:
             values = self.calibrated(values)
         elif self._sound.applies:
             values = self._by_sound_speed(sensor, values)
-        if sensor in ACOUSTICS and self._is_unplaced(sensor, values):
-            return None
+        return None if sensor in ACOUSTICS and self._is_unplaced(sensor, values) else self._new(time, sensor, values)
+
+    def _new(self, time: float, sensor: str, values: Array) -> Measurement | None:
+        """A measurement of calibrated values; None where the sensor has just been heard at that time."""
         size = len(values)
         if size != self._sizes.setdefault(sensor, size):
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
@@ -131,6 +140,29 @@ class Intake:
             return None
         self._newest[of] = max(time, newest)
         return Measurement(time, sensor, self._with_known_sd(sensor, values), 0)
+
+    def _depth(self, time: float, column: str, value: float) -> float | None:
+        """Depth [m] of a depth or a pressure; None where the other column is used, or no water has such a pressure."""
+        by = self._depths_by = self._depths_by if self._depths_by == self._depth_source else column
+        if column != by:
+            self._left_out[column, f"ignored beside {by}"] += 1
+            return None
+        if column == "depth":
+            return value
+        before = self.pressure.surface.value
+        surface = np.array([self.pressure.take(time, value)])
+        if math.isnan(before) and not math.isnan(self.pressure.surface.value):
+            self.news.append(("depth", self.pressure.says(surface)))
+        latitude = None if self.origin is None else self.origin[0]
+        below = float(self.pressure.depth(np.array([value]), surface, latitude)[0])
+        if math.isnan(below):
+            self._left_out["pressure", "less than any air's"] += 1
+            return None
+        return below
+
+    def choose_depth_again(self) -> None:
+        """Forget which column depths came from, as a recording that is read again has one for both."""
+        self._depths_by = ""
 
     def _is_unplaced(self, sensor: str, values: Array) -> bool:
         """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""

@@ -173,6 +173,7 @@ class Navigator:
                 accepted = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
                 if accepted is not None:
                     self._consider(accepted, by_hand=accepted.sensor == "fix")  # some may be
+        self._intake.choose_depth_again()
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
 
@@ -254,6 +255,7 @@ class Navigator:
             "rejected": dict(self.health.rejected),
             "incoherence": np.array(self._incoherence.state()),
             "faults": self.faults.state(),
+            "surface": np.array(self._intake.pressure.surface.state()),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -267,6 +269,8 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
+        if "surface" in state:  # not of an earlier version
+            self._intake.pressure.surface.restore(state["surface"].tolist())
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0

@@ -243,8 +243,9 @@ def _log(tables: Iterable[Table], config: Config | None, source: str, before: It
     """A log of tables that share no stream, with what was warned of ``before`` and while its streams were made."""
     config = config_or_defaults(config)
     with collected_warnings() as texts:
-        streams, origin = read_streams(tables, config, source)
-    return Log(source, streams, origin, config, (*before, *texts))
+        notes: list[str] = []
+        streams, origin = read_streams(tables, config, source, notes)
+    return Log(source, streams, origin, config, (*before, *texts), notes=tuple(notes))
 
 
 def _entry(config: Config, key: str) -> object:

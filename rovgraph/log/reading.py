@@ -47,6 +47,7 @@ from rovgraph.model.config import Config, TableSettings
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
+from rovgraph.sensors.pressure import complaints, depths
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
@@ -59,13 +60,16 @@ Lines = NDArray[np.int64]
 Origin = tuple[float, float] | None  # latitude and longitude [deg] of north = east = 0
 
 
-def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[dict[str, Stream], Origin]:
+def read_streams(
+    tables: Iterable[Table], config: Config, source: str, notes: list[str] | None = None
+) -> tuple[dict[str, Stream], Origin]:
     """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
     Parameters
     ----------
     tables : whose columns feed different streams
     source : their name, for messages
+    notes : to be added to, how it was read
 
     Returns
     -------
@@ -89,6 +93,7 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
         found |= streams
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
+    _add_depth(found, config, origin, source, [] if notes is None else notes)
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
@@ -96,6 +101,36 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
         if delay := delay_of(config, sensor):
             found[sensor] = replace(found[sensor], time=found[sensor].time - delay)
     return found | with_sound_speed(found, found, config), origin
+
+
+def _add_depth(found: dict[str, Stream], config: Config, origin: Origin, source: str, notes: list[str]) -> None:
+    """Turn pressures into depths, or leave them out beside depths.
+
+    Raises
+    ------
+    InputError : they are no absolute pressures
+    """
+    pressure = found.pop("pressure", None)
+    if pressure is None:
+        return
+    if "depth" in found and config.depth.source == "depth":
+        warn(f"{source}: pressure is ignored beside depth; depth.source: pressure uses it instead")
+        return
+    if found.pop("depth", None) is not None:
+        warn(f"{source}: depth is ignored beside pressure; depth.source: depth uses it instead")
+    pascal = pressure["pressure"]
+    if config.depth.surface_hpa is None:
+        factor = UNITS["pressure"].get(config.units.get("pressure", ""), 1.0)
+        for text in complaints(pascal, factor, UNITS["pressure"], source):
+            warn(text)
+    below, said = depths(pressure.time, pascal, config, None if origin is None else origin[0])
+    known = np.isfinite(below)
+    if not known.all():
+        warn(f"{source}: pressure: {(~known).sum()} are less than any air's, left out")
+    notes.append(said)
+    if known.any():
+        depth = replace(pressure, sensor="depth", columns=STREAMS["depth"], data=below[:, None])
+        found["depth"] = depth.take(known)
 
 
 def with_sound_speed(of_dvl: Mapping[str, Stream], streams: Mapping[str, Stream], config: Config) -> dict[str, Stream]:

@@ -5,11 +5,12 @@ from functools import partial
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
+from rovgraph.geometry import normal_gravity
 from rovgraph.model.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
@@ -70,15 +71,23 @@ class StartSettings(ConfigSection):
 class Environment(ConfigSection):
     """Gravity, magnetic field and Earth rate."""
 
-    gravity_mps2: Positive = Field(9.81, description="gravity")
+    gravity_mps2: Positive | None = Field(
+        None, description="gravity; null = normal gravity of the latitude and depth, 9.81 without a latitude"
+    )
     origin_lat_deg: Latitude | None = Field(
         None, description="latitude of north = east = 0; null = of the first fix_lat, where there is one"
     )
     origin_lon_deg: Annotated[float, Field(ge=-180, le=360)] | None = Field(
         None, description="longitude of north = east = 0, east positive"
     )
-    latitude_deg: Latitude | None = Field(None, description="latitude, for Earth rotation; null = of the origin")
-    declination_deg: float = Field(0.0, description="magnetic declination, east positive")
+    latitude_deg: Latitude | None = Field(
+        None, description="latitude, for gravity and Earth rotation; null = of the origin"
+    )
+    declination_deg: float = Field(
+        0.0,
+        description="magnetic declination, east positive; not given = by place and date for a magnetometer that is the "
+        "only compass, else 0",
+    )
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
     )
@@ -98,6 +107,25 @@ class Environment(ConfigSection):
         """Latitude and longitude [deg] of north = east = 0, where they are stated."""
         lat, lon = self.origin_lat_deg, self.origin_lon_deg
         return None if lat is None or lon is None else (lat, lon)
+
+    @property
+    def latitude(self) -> float | None:
+        """Latitude [deg], as stated or of a stated origin."""
+        return self.origin_lat_deg if self.latitude_deg is None else self.latitude_deg
+
+    @property
+    def gravity(self) -> float:
+        """Gravity [m/s^2], as stated or at the surface of the latitude."""
+        return float(self.gravity_at(0.0))
+
+    def gravity_at(self, depth: ArrayLike) -> NDArray[np.float64]:
+        """Gravity [m/s^2] at depths [m], shape of these: one that is stated holds at all of them."""
+        if self.gravity_mps2 is not None or self.latitude is None:
+            return np.broadcast_to(UNKNOWN_GRAVITY if self.gravity_mps2 is None else self.gravity_mps2, np.shape(depth))
+        return normal_gravity(np.deg2rad(self.latitude), depth)
+
+
+UNKNOWN_GRAVITY = 9.81  # where no latitude is known [m/s^2]
 
 
 class ImuNoise(ConfigSection):
@@ -274,6 +302,15 @@ class TiltSettings(ConfigSection):
 class Depth(ConfigSection):
     """Pressure sensor."""
 
+    source: Literal["depth", "pressure"] = Field(
+        "depth", description="column that depths come from where a log has both; else the one that it has"
+    )
+    surface_hpa: NotNegative | None = Field(
+        None, description="air pressure at the surface [hPa], 0 = taken off already; null = found at the surface"
+    )
+    density_kgm3: Annotated[float, Field(ge=900, le=1300)] | None = Field(
+        None, description="density of the water [kg/m3], for depth by pressure; null = by sound.salinity_psu, else 1025"
+    )
     sd_m: Positive = Field(0.05, description="noise of a depth sample")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")

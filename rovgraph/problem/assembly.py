@@ -453,7 +453,7 @@ class Assembly:
         known = first + int(self._dive.counts[at.FORGOTTEN])
         if time - table[-1, 0] > self._steps[min(known + len(table), len(self._steps)) - 1]:
             at_rest = x[15:].copy()
-            at_rest[:3] -= self.config.environment.gravity_mps2 * x[6:9]
+            at_rest[:3] -= self.config.environment.gravity * x[6:9]
             table = np.vstack([table, np.append(time, at_rest)])
         dive.keyframes[:] = newest
         dive.keyframes[1, [at.TIME, at.COUNT, at.HERE]] = time, known + len(table), 0

@@ -47,7 +47,7 @@ def has_constant_velocity(config: Config) -> bool:
 
 def gravity(config: Config) -> float:
     """Gravity that the motion is integrated with, 0 without an accelerometer [m/s^2]."""
-    return 0.0 if has_constant_velocity(config) else config.environment.gravity_mps2
+    return 0.0 if has_constant_velocity(config) else config.environment.gravity
 
 
 def ticks(log: Log) -> Stream:
@@ -92,7 +92,7 @@ def preintegration_params(config: Config) -> PreintegrationParams:
     noise, env = config.imu.noise, config.environment
     rate = earth_rate_n(np.deg2rad(env.latitude_deg or 0.0)) if env.earth_rotation else np.zeros(3)
     densities = (noise.acc, noise.gyr, noise.acc_walk, noise.gyr_walk, INTEGRATION_SD)
-    return PreintegrationParams(densities, env.gravity_mps2, rate)
+    return PreintegrationParams(densities, env.gravity, rate)
 
 
 def scatter(time: Array, samples: Array) -> Array:

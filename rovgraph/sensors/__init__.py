@@ -14,6 +14,7 @@ from rovgraph.sensors.dvl_sound import DVL_SOUND
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
 from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
 from rovgraph.sensors.position import DEPTH, FIX, SEEN_PLACE, PlaceOffset, Position
+from rovgraph.sensors.pressure import PRESSURE
 from rovgraph.sensors.sensor import (
     MOSTLY,
     SENSORS,
@@ -84,5 +85,5 @@ IMU = Sensor(  # it carries the estimate from one measurement to the next
 _VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
 _DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DVL_SOUND, DVL_BEAMS, *SINGLE_BEAMS
 _ACOUSTIC = USBL, RANGE, SHIP, SHIP_HEADING, SHIP_TILT
-for _sensor in (IMU, MAG, AHRS, *_VEHICLE, *_DVL, DEPTH, FIX, SEEN_PLACE, *_ACOUSTIC, THRUSTER):
+for _sensor in (IMU, MAG, AHRS, *_VEHICLE, *_DVL, DEPTH, PRESSURE, FIX, SEEN_PLACE, *_ACOUSTIC, THRUSTER):
     SENSORS[_sensor.name] = _sensor

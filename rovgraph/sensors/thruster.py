@@ -177,7 +177,7 @@ def hydrodynamics(config: Config) -> Hydrodynamics:
         turning_drag_linear=np.array(vehicle.turning_drag_linear),
         turning_drag_quadratic=np.array(vehicle.turning_drag_quadratic),
         centre_of_buoyancy=np.array(vehicle.centre_of_buoyancy_m),
-        buoyancy=vehicle.mass_kg * config.environment.gravity_mps2,
+        buoyancy=vehicle.mass_kg * config.environment.gravity,
         thrust_curve=np.array(vehicle.thrust),
         thruster_positions=np.array([t.position_m for t in vehicle.thrusters], float).reshape(-1, 3),
         thruster_directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
@@ -187,7 +187,7 @@ def hydrodynamics(config: Config) -> Hydrodynamics:
 def thrusters(config: Config, origin_b: Array) -> Instrument:
     """Thrust and drag; the sd is that of a mean over one second."""
     vehicle = config.vehicle
-    model = ModelAiding(hydrodynamics(config), origin_b, config.environment.gravity_mps2, vehicle.thrust_rise_s)
+    model = ModelAiding(hydrodynamics(config), origin_b, config.environment.gravity, vehicle.thrust_rise_s)
     return instrument(vehicle, model, vehicle.acceleration_sd_mps2, ("x", "y", "z"))
 
 

@@ -69,7 +69,8 @@ def specific_force_and_rate(motion: Motion, config: Config) -> Array:
     ndarray, shape (n, 6), specific force [m/s^2], angular rate [rad/s]
     """
     arm = np.asarray(config.imu.lever_arm_m, float)
-    w_ie_n, g_n = _earth_rate(config), np.array([0.0, 0.0, config.environment.gravity_mps2])
+    w_ie_n, g_n = _earth_rate(config), np.zeros((len(motion.p_n), 3))
+    g_n[:, 2] = config.environment.gravity_at(motion.p_n[:, 2])
     R_bn = transpose(motion.R_nb)
     w_ie_b = rotate(R_bn, w_ie_n)
     swing = np.cross(motion.w_b, arm)

@@ -23,11 +23,13 @@ from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
+from rovgraph.inference.initialise import field_by_place
 from rovgraph.log import Log
 from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.sensors import SENSORS, Level
+from rovgraph.sensors.earth_field import BLACKOUT_NT
 from rovgraph.sensors.instruments import heading_sources
 
 
@@ -77,11 +79,19 @@ def _assumptions(log: Log, config: Config, sources: list[str]) -> Iterator[str]:
         if sensor in log and "lever_arm_m" not in section.model_fields_set:
             yield f"{sensor}.lever_arm_m is not given: taken as zero"
     if sources and "declination_deg" not in env.model_fields_set:
-        yield "environment.declination_deg is not given: magnetic north is taken as north"
+        yield f"environment.declination_deg is not given: {_north(log, config)}"
     if "mag" in sources and (env.field_norm is None or env.dip_deg is None):
         yield "environment.field_norm or dip_deg is not given: taken from the log"
     if env.earth_rotation and env.latitude_deg is None:
         yield "environment.latitude_deg is not given: taken from the first fix_lat"
+
+
+def _north(log: Log, config: Config) -> str:
+    """What is taken for north where no declination is stated."""
+    field = field_by_place(log, config)
+    if field is None or field.horizontal_nt <= BLACKOUT_NT:
+        return "magnetic north is taken as north"
+    return f"{field.declination_deg:.2f} by WMM2025 at the origin and the date of the log"
 
 
 def places(log: Log, config: Config) -> Iterator[Finding]:

@@ -176,7 +176,7 @@ def _imu_model(
     variant: Filter, config: Config, places: Layout, known: KnownMotion | None, priors: dict[str, Belief]
 ) -> ImuModel | None:
     R_bs, arm = mount_matrix(config.imu.mount_rpy_deg), np.asarray(config.imu.lever_arm_m, float)
-    gravity = config.environment.gravity_mps2
+    gravity = config.environment.gravity
     if known is not None:
         return Accelerometer(places, R_bs, arm, gravity, known) if variant.accelerometer else None
     field_n = reference_field(instruments(config)["mag"], priors)

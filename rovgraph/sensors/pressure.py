@@ -1,0 +1,186 @@
+"""Depth by pressure: the air's pressure at the surface, the water's density and gravity, in one place.
+
+    depth = x / (1 + k x / 2 g),  x = (pressure - surface) / (density g)
+
+where g is gravity at the surface and k its growth with depth (`rovgraph.geometry.BY_DEPTH`); the density is constant.
+Reading a log and the online mode take pressures one by one through the same `DepthByPressure`, so their depths agree.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import BY_DEPTH, Array, normal_gravity
+from rovgraph.model.config import Config
+from rovgraph.sensors.sensor import Column, Sensor
+
+PRESSURE = Sensor("pressure", (Column("pressure", "pressure"),), may_begin_later=True)  # becomes the stream "depth"
+STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
+LEAST, MOST = 50_000.0, 108_500.0  # of air where people dive, mountain lakes included [Pa]
+SEA = 1025.0  # density [kg/m^3]
+FRESH, BY_SALT = 999.7, 0.778  # at 10 deg C [kg/m^3], and by a psu
+BLOCK_S = 5.0  # of pressures that are looked at together
+CALM_PA = 1500.0  # spread of a block in which the vehicle keeps its depth
+SAME_PA = 1000.0  # change of the air's pressure between two stays at the surface: 10 cm of water
+GAUGE_PA = 5000.0  # least of a pressure from which the air's was taken off
+
+
+def density(config: Config) -> float:
+    """Of the water, as stated, or by its salinity, else of the sea [kg/m^3]."""
+    stated, salinity = config.depth.density_kgm3, config.sound.salinity_psu
+    if stated is not None:
+        return stated
+    return SEA if salinity is None else FRESH + BY_SALT * salinity
+
+
+class SurfacePressure:
+    """Pressure of the air, by what was measured so far: of the newest stay at the surface.
+
+    It begins with the least pressure of the first block. A stay begins with a lower one, or where two calm blocks in a
+    row come back to that of the stay before, within `SAME_PA`. It is a mean of medians, so that waves hardly move it.
+
+    Parameters
+    ----------
+    stated : as the configuration has it [Pa], None = to be found
+
+    Attributes
+    ----------
+    value : [Pa], NaN while unknown
+    """
+
+    def __init__(self, stated: float | None) -> None:
+        self.value = math.nan if stated is None else stated
+        self._finds = stated is None
+        self._block: list[float] = []
+        self._begin, self._mean, self._count = 0.0, 0.0, 0
+        self._first = True
+
+    def take(self, time: float, pascal: float) -> float:
+        """Take a pressure; the surface's at that time [Pa], NaN = not known yet."""
+        if not self._finds:
+            return self.value
+        if self._block and not 0.0 <= time - self._begin < BLOCK_S:
+            self._close()
+        if not self._block:
+            self._begin = time
+        self._block.append(pascal)
+        if self._first and LEAST <= (least := min(self._block)) <= MOST:
+            return least
+        return self.value
+
+    def _close(self) -> None:
+        low, level, high = np.quantile(self._block, [0.05, 0.5, 0.95]).tolist()
+        self._block = []
+        if self._first and high - low > CALM_PA and LEAST <= low <= MOST:
+            self.value = low
+        self._first = False
+        if high - low > CALM_PA or not LEAST <= level <= MOST or level > self.value + SAME_PA:
+            self._count = 0
+            return
+        if not level >= self.value - SAME_PA:  # the first, or nearer to the surface than all before
+            self.value, self._mean, self._count = level, level, 1
+            return
+        self._mean = (self._count * self._mean + level) / (self._count + 1)
+        self._count += 1
+        if self._count > 1:
+            self.value = self._mean
+
+    def state(self) -> list[Any]:
+        """Plain values from which `restore` goes on."""
+        return [self.value, self._begin, self._mean, self._count, self._first, *self._block]
+
+    def restore(self, state: list[Any]) -> None:
+        """Go on from the state of another."""
+        self.value, self._begin, self._mean, self._count, first, *self._block = state
+        self._first = bool(first)
+
+
+class DepthByPressure:
+    """Turns pressures into depths, one by one.
+
+    Parameters
+    ----------
+    config : has ``depth.surface_hpa``, ``depth.density_kgm3`` and ``environment``
+    """
+
+    def __init__(self, config: Config) -> None:
+        stated = config.depth.surface_hpa
+        self.surface = SurfacePressure(None if stated is None else 100.0 * stated)
+        self._environment, self._density = config.environment, density(config)
+
+    def take(self, time: float, pascal: float) -> float:
+        """Pressure at the surface, after a pressure [Pa]; NaN = not known yet."""
+        return self.surface.take(time, pascal)
+
+    def depth(self, pascal: Array, surface: Array, latitude: float | None) -> Array:
+        """Depths [m], shape (n,); NaN where no water has such a pressure.
+
+        Parameters
+        ----------
+        pascal : shape (n,)
+        surface : shape (n,), of `take`; where it is not known, the standard atmosphere's
+        latitude : of the first fix [deg], None = not known
+        """
+        env = self._environment
+        latitude = env.latitude if env.latitude is not None else latitude
+        normal = env.gravity_mps2 is None and latitude is not None
+        gravity = float(normal_gravity(np.deg2rad(latitude))) if normal else env.gravity  # type: ignore[arg-type]
+        surface = np.where(np.isnan(surface), STANDARD, surface)
+        x = (pascal - surface) / (self._density * gravity)
+        possible = np.isfinite(pascal) & (pascal >= np.minimum(surface - GAUGE_PA, LEAST))
+        return np.where(possible, x / (1.0 + (BY_DEPTH if normal else 0.0) * x / (2.0 * gravity)), np.nan)
+
+    def says(self, surface: Array) -> str:
+        """What the depths rest on, by the pressures of the surface, shape (n,)."""
+        known = surface[np.isfinite(surface)]
+        how = "as stated" if not self.surface._finds else "found where the vehicle was there"
+        what = f"{known.min() / 100.0:.1f} to {known.max() / 100.0:.1f} hPa, {how}" if len(known) else ""
+        what = what or f"{STANDARD / 100.0:.1f} hPa, the standard atmosphere, as the vehicle was never there"
+        return f"depth by pressure: at the surface {what}; water of {self._density:.0f} kg/m3"
+
+
+def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -> tuple[Array, str]:
+    """Depths of a log's pressures, shape (n,) each, and what they rest on.
+
+    Before the vehicle is at the surface for the first time, the pressure there is that of the first time.
+    """
+    by = DepthByPressure(config)
+    surface = np.array([by.take(t, p) for t, p in zip(time.tolist(), pascal.tolist(), strict=True)])
+    known = np.flatnonzero(np.isfinite(surface))
+    if len(known):
+        surface[: known[0]] = surface[known[0]]
+    return by.depth(pascal, surface, latitude), by.says(surface)
+
+
+def complaints(pascal: Array, factor: float, units: dict[str, float], source: str) -> Iterator[str]:
+    """Doubts about pressures in a log that states no ``depth.surface_hpa``, a line each.
+
+    Parameters
+    ----------
+    pascal : ndarray, shape (n,), as converted
+    factor : of the unit that they were converted from
+    units : unit -> its factor
+
+    Raises
+    ------
+    InputError : they are no absolute pressures
+    """
+    least, most = (float(np.nanquantile(pascal, q)) for q in (0.01, 0.99))
+    meant = [unit for unit, to_pascal in units.items() if 87_000.0 <= least / factor * to_pascal <= MOST]
+    better = f"state units: {{pressure: {meant[-1]}}}" if meant else ""
+    if least > MOST:
+        hint = f"if it was at the surface, the unit is {meant[-1]}: {better}" if meant else "state depth.surface_hpa"
+        yield (
+            f"{source}: pressure: at least {least / 100.0:.0f} hPa, so never at the surface, where the standard "
+            f"atmosphere's {STANDARD / 100.0:.0f} hPa are taken; {hint}"
+        )
+    elif least < LEAST:
+        said = f"{source}: pressure: {least:.4g} to {most:.4g} Pa, and no air has so little"
+        if meant:
+            raise InputError(f"{said}; {better}")
+        if most - least < GAUGE_PA:
+            raise InputError(f"{said}; if these are metres, name the column depth; else state its unit under units")
+        raise InputError(f"{said}; if the air's is taken off, state depth.surface_hpa: 0; else state units: pressure")

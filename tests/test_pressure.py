@@ -1,0 +1,147 @@
+"""Depth by pressure: the surface, the water, units, and what is told apart by its numbers."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import rovgraph as rg
+from rovgraph.geometry import Array, normal_gravity
+from rovgraph.live.intake import Intake
+from rovgraph.live.message import Reading
+from rovgraph.log import Log
+from rovgraph.model.config import Config
+from rovgraph.sensors.pressure import SurfacePressure, density, depths
+
+AIR = 100_300.0
+TIME = np.arange(0.0, 600.0, 0.5)
+
+
+def dive(
+    deepest: float = 30.0, begin: float = 60.0, end: float = 540.0, air: Array | float = AIR
+) -> tuple[Array, Array]:
+    """Depth and pressure in sea water at latitude 60, at the surface before ``begin`` and after ``end`` [s]."""
+    depth = deepest * np.clip(np.minimum(TIME - begin, end - TIME) / 100.0, 0.0, 1.0)
+    gravity = normal_gravity(np.deg2rad(60.0), 0.5 * depth)
+    return depth, air + 1025.0 * gravity * depth
+
+
+def log_of(pressure: Array, config: Config | None = None, **more: Array) -> Log:
+    return Log.from_arrays({"time": TIME, "pressure": pressure, **more}, config=config)
+
+
+NORTH = Config().changed(environment={"latitude_deg": 60.0})
+
+
+def test_depth_is_by_surface_density_and_gravity() -> None:
+    depth, pressure = dive(deepest=500.0)
+    log = log_of(pressure, NORTH)
+    np.testing.assert_allclose(log["depth"]["depth"], depth, atol=2e-3)
+    assert log.notes == ("depth by pressure: at the surface 1003.0 to 1003.0 hPa, found where the vehicle was there; "
+                         "water of 1025 kg/m3",)  # fmt: skip
+
+
+@pytest.mark.parametrize(("begin", "end"), [(60.0, 600.0), (-100.0, 540.0)])
+def test_the_surface_is_found_before_or_after_the_dive(begin: float, end: float) -> None:
+    depth, pressure = dive(begin=begin, end=end)
+    np.testing.assert_allclose(depths(TIME, pressure, NORTH, None)[0], depth, atol=5e-3)
+
+
+def test_a_new_stay_at_the_surface_brings_the_air_of_then_and_a_shallow_stop_does_not() -> None:
+    for change, expected in ((600.0, 600.0), (1500.0, 0.0)):
+        depth, pressure = dive(air=AIR + np.where(TIME > 300.0, change, 0.0))
+        found = depths(TIME, pressure, NORTH, None)[0]
+        late = TIME > 570.0
+        np.testing.assert_allclose(found[late], depth[late] + (change - expected) / (1025.0 * 9.8192), atol=5e-3)
+
+
+def test_waves_do_not_move_the_surface() -> None:
+    surface, rng = SurfacePressure(None), np.random.default_rng(1)
+    swell = 500.0 * np.sin(2.0 * np.pi * TIME / 6.0) + rng.normal(0.0, 30.0, len(TIME))
+    found = [surface.take(t, p) for t, p in zip(TIME, AIR + swell, strict=True)]
+    assert abs(found[-1] - AIR) < 100.0  # 1 cm
+
+
+def test_the_online_mode_has_the_depths_of_the_log() -> None:
+    rng = np.random.default_rng(2)
+    _, pressure = dive(air=AIR + np.where(TIME > 300.0, 400.0, 0.0))
+    pressure = pressure + rng.normal(0.0, 50.0, len(TIME))
+    intake = Intake(NORTH, Counter())
+    live = [intake.measurement(t, Reading("pressure", np.array([p]))) for t, p in zip(TIME, pressure, strict=True)]
+    np.testing.assert_array_equal(
+        [m.values[0] for m in live if m is not None], log_of(pressure, NORTH)["depth"]["depth"]
+    )
+    assert {m.sensor for m in live if m is not None} == {"depth"}
+    ((_, said),) = intake.news
+    assert said.startswith("depth by pressure: at the surface 1003.")
+
+
+def test_the_surface_is_kept_over_a_restart() -> None:
+    _, pressure = dive(begin=60.0)
+    first, second, whole = SurfacePressure(None), SurfacePressure(None), SurfacePressure(None)
+    for t, p in zip(TIME[:300], pressure[:300], strict=True):
+        first.take(t, p)
+    second.restore(first.state())
+    expected = [whole.take(t, p) for t, p in zip(TIME, pressure, strict=True)][300:]
+    np.testing.assert_array_equal(
+        [second.take(t, p) for t, p in zip(TIME[300:], pressure[300:], strict=True)], expected
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "pascal"), [("kPa", 1e3), ("bar", 1e5), ("dbar", 1e4), ("psi", 6894.757), ("hPa", 1e2)]
+)
+def test_units_and_the_unit_that_numbers_are_in(unit: str, pascal: float) -> None:
+    depth, pressure = dive()
+    right = NORTH.changed(units={"pressure": unit})
+    np.testing.assert_allclose(log_of(pressure / pascal, right)["depth"]["depth"], depth, atol=2e-3)
+    with pytest.raises(rg.InputError, match=rf"no air has so little; state units: {{pressure: {unit}}}"):
+        log_of(pressure / pascal, NORTH)
+
+
+def test_psi_taken_for_bar_is_told() -> None:
+    _, pressure = dive()
+    with pytest.warns(rg.DataWarning, match=r"never at the surface.*the unit is psi: state units: \{pressure: psi\}"):
+        log_of(pressure / 6894.757, NORTH.changed(units={"pressure": "bar"}))
+    with pytest.raises(rg.InputError, match=r"state units: \{pressure: bar\}"):
+        log_of(pressure / 1e5, NORTH.changed(units={"pressure": "psi"}))
+
+
+def test_depths_and_gauge_pressures_in_the_column_are_told() -> None:
+    depth, pressure = dive()
+    with pytest.raises(rg.InputError, match="if these are metres, name the column depth"):
+        log_of(depth)
+    with pytest.raises(rg.InputError, match=r"if the air's is taken off, state depth\.surface_hpa: 0"):
+        log_of(pressure - AIR)
+    gauge = NORTH.changed(depth={"surface_hpa": 0})
+    np.testing.assert_allclose(log_of(pressure - AIR, gauge)["depth"]["depth"], depth, atol=2e-3)
+
+
+def test_a_surface_that_is_never_reached_is_the_standard_atmospheres() -> None:
+    depth, pressure = dive(begin=-200.0, end=900.0, air=101_325.0)
+    with pytest.warns(rg.DataWarning, match=r"never at the surface, .* 1013 hPa are taken; state depth\.surface_hpa"):
+        log = log_of(pressure, NORTH)
+    np.testing.assert_allclose(log["depth"]["depth"], depth, atol=2e-3)
+    assert "the standard atmosphere, as the vehicle was never there" in log.notes[0]
+
+
+def test_beside_depth_one_is_chosen_and_the_other_named() -> None:
+    depth, pressure = dive()
+    with pytest.warns(rg.DataWarning, match="pressure is ignored beside depth"):
+        log = log_of(pressure, NORTH, depth=depth + 1.0)
+    np.testing.assert_allclose(log["depth"]["depth"], depth + 1.0)
+    chosen = NORTH.changed(depth={"source": "pressure"})
+    with pytest.warns(rg.DataWarning, match="depth is ignored beside pressure"):
+        log = log_of(pressure, chosen, depth=depth + 1.0)
+    np.testing.assert_allclose(log["depth"]["depth"], depth, atol=2e-3)
+    intake, left_out = Intake(NORTH, left := Counter()), left
+    for column, value in (("pressure", AIR), ("depth", 3.0), ("pressure", AIR)):
+        intake.measurement(TIME[sum(left_out.values())], Reading(column, np.array([value])))
+    assert left_out["pressure", "ignored beside depth"] == 1
+
+
+def test_the_density_is_stated_or_by_salinity_or_of_the_sea() -> None:
+    assert density(Config()) == 1025.0
+    assert density(Config().changed(sound={"salinity_psu": 0})) == pytest.approx(999.7)
+    assert density(Config().changed(sound={"salinity_psu": 35})) == pytest.approx(1026.95, abs=0.1)
+    assert density(Config().changed(sound={"salinity_psu": 35}, depth={"density_kgm3": 1010})) == 1010.0
