@@ -34,6 +34,7 @@ from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
+from rovgraph.sensors.water_layer import CELLS
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
@@ -46,7 +47,7 @@ SURE = 3.0  # standard deviations
 SMALL_S = 0.05  # difference of gap and jump up to which no samples are missing [s]
 CLOCKED = {  # by one clock
     "imu": ("imu", "mag", "ahrs"),
-    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", "dvl_sound", BEAMS),
+    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", "dvl_sound", BEAMS, CELLS),
 }
 NAMES = {"imu": "IMU", "dvl": "DVL"}
 
@@ -246,7 +247,9 @@ REPEATED = 0.2  # share of repeated samples that a sensor does not produce by it
 
 
 def timing(stream: Stream) -> Timing:
-    """When the measurements of one sensor came."""
+    """When the measurements of one sensor came; of cells of the water, profiles."""
+    if stream.sensor == CELLS:
+        stream = stream.take(np.diff(stream.time, prepend=-np.inf) > 0.0)
     periods = np.diff(stream.time)
     data = told(stream)
     again = int((repeats(data) & ~np.isnan(data).all(axis=1)).sum())
