@@ -246,10 +246,14 @@ BATCHED = 0.5  # share of measurements that have the stamp of another, beyond wh
 REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
 
 
+def _without_cells(stream: Stream) -> Stream:
+    """Of profiles of the water the first cell of each, which are of one time."""
+    return stream.take(np.diff(stream.time, prepend=-np.inf) > 0.0) if stream.sensor == CELLS else stream
+
+
 def timing(stream: Stream) -> Timing:
-    """When the measurements of one sensor came; of cells of the water, profiles."""
-    if stream.sensor == CELLS:
-        stream = stream.take(np.diff(stream.time, prepend=-np.inf) > 0.0)
+    """When the measurements of one sensor came."""
+    stream = _without_cells(stream)
     periods = np.diff(stream.time)
     data = told(stream)
     again = int((repeats(data) & ~np.isnan(data).all(axis=1)).sum())
@@ -316,7 +320,8 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
 
 def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -> Iterator[Finding]:
     """Rates, gaps, jitter and repeated samples; ``frozen`` are measurements that another check names."""
-    for sensor, stream in log.streams.items():
+    for sensor, every in log.streams.items():
+        stream = _without_cells(every)
         t = timing(stream)
         if np.isnan(t.rate):
             yield Finding(sensor, "warning", "only one measurement")
