@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dives import changed, falcon, kept, simulated, started, without
 
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
@@ -16,12 +15,14 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.log import Log, Stream
 from rovgraph.log.adcp import usable_cells
-from rovgraph.model.calibration import WATER_LAYER
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, parse_config
+from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
-from rovgraph.problem.layers import SETTLED_S, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.problem.layers import WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.sensors.dvl import DvlVelocity
 from rovgraph.sensors.dvl_beam import beam_geometry
-from rovgraph.sensors.water_layer import ADCP, CELLS
+from rovgraph.sensors.water_layer import ADCP, CELLS, WaterLayer
 
 NAMES = ADCP.column_names
 JANUS = {"angle_deg": 20.0, "azimuth_deg": [270.0, 90.0, 0.0, 180.0]}
@@ -222,19 +223,15 @@ def test_a_dive_measurement_by_measurement_has_the_rows_of_the_whole_log(descent
     np.testing.assert_allclose(*rows, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_one_knot_is_water_track():
-    """Cells of one profile each, with one current for all depths, give what water track gives."""
-    case = simulated(falcon(), 60.0, 6, water_track=True, dropouts=((20.0, 40.0),), imu_rate=50.0, depth_rate=2.0)
-    config = started(case)
-    track, water = case.log, case.log["dvl_water"]
-    table = {"time": water.time, "range": np.full(len(water), 3.0)}
-    table |= {f"v{axis}": water.data[:, k] for k, axis in enumerate("xyz")}
-    layered = changed(config, water={"knots": 1, "cell_sd_mps": list(config.dvl.water_velocity_sd_mps)})
-    by_cells = without(track, "dvl_water").with_profiles(usable_cells(table, layered, "adcp"))
-    late = water.time[water.time > track.start + SETTLED_S]
-    track = kept(track, "dvl_water", np.isin(water.time, late))
-    a, b = (assemble(log, initialise(log, c)).solve() for log, c in ((track, config), (by_cells, layered)))
-    ends = [estimate.trajectory.to_frame().iloc[-1] for estimate in (a, b)]
-    for name in ("north", "east", "north_sd", "east_sd"):
-        assert ends[0][name] == pytest.approx(ends[1][name], abs=2e-3)
+def test_with_one_knot_a_layer_has_the_equation_of_water_track():
+    rng, at_current = np.random.default_rng(3), np.zeros((1, at.LAYER_WIDTH))
+    at_current[0, [at.ABOVE_AT, at.BELOW_AT]] = LAYOUT["current"].start
+    calibration = {name: 0.1 * rng.standard_normal(v.dim) for name, v in TABLE.items()}
+    state = State(matrix_from_rpy([[0.1, -0.2, 1.0]]), *rng.standard_normal((2, 1, 3)), np.zeros((1, 6)), calibration)
+    rate = rng.standard_normal((1, 3))
+    layer = WaterLayer(at_current, knots=1).predict(state, rate)
+    track = DvlVelocity(np.zeros(3), "dvl_water").predict(state, rate)
+    np.testing.assert_array_equal(layer[0], track[0])
+    assert layer[1].keys() == track[1].keys()
+    for name, by in track[1].items():
+        np.testing.assert_array_equal(layer[1][name], by)
