@@ -21,7 +21,7 @@ from rovgraph.geometry import Array
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.graph.isam2 import IncrementalEstimator
 from rovgraph.log import Log
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import LAYERS, TABLE
 from rovgraph.model.config import Config
 
 DEG = float(np.deg2rad(1.0))
@@ -76,7 +76,7 @@ def test_a_lively_dive_shows_the_variable_among_all_others(kind, name):
 
 def late(offset: float, sd: float, seconds: float = 50.0, noise: bool = False) -> Simulated:
     """A dive with late stamps, and a configuration that expects them to be off by ``sd``."""
-    others = {name: {"estimate": False} for name in TABLE}
+    others = {name: {"estimate": False} for name in TABLE if name not in LAYERS}
     config = falcon(calibration=others | {OFFSET: {"estimate": True, "sd": sd}})
     truth = {OFFSET: np.array([offset])}
     return simulated(config, seconds, seed=2, noise=noise, calibration=truth, dvl_rate=PINGS)

@@ -20,7 +20,7 @@ from rovgraph.inference.graph.optimum import GraphOptimum
 from rovgraph.inference.graph.places import smooth_graph
 from rovgraph.inference.optimum import Optimum
 from rovgraph.log import STREAMS, Log, Stream
-from rovgraph.model.calibration import BEAM_SENSORS, TABLE
+from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, TABLE
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.state import BIAS, POSE, VELOCITY
 from rovgraph.sensors import SENSORS
@@ -67,7 +67,7 @@ def scales() -> Case:
 
 
 def time_offset() -> Case:
-    others = {name: {"estimate": False} for name in TABLE}
+    others = {name: {"estimate": False} for name in TABLE if name not in LAYERS}
     config = falcon(calibration=others | {"dvl_time_offset": {"estimate": True, "sd": 0.1}})
     case = simulated(config, 45.0, seed=2, calibration={"dvl_time_offset": np.array([0.1])}, **SHORT)
     return case.log, started(case)

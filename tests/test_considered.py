@@ -214,7 +214,7 @@ def test_a_walk_of_what_is_considered_is_refused_and_not_passed_over(changes):
 def test_what_is_estimated_in_any_case_cannot_be_left_to_a_search_that_does_not_look_for_it():
     with pytest.raises(InputError, match=r"calibration\.water_oscillation\.estimate"):
         parse_config("calibration: {water_oscillation: {estimate: auto}}")
-    automatic = [name for name in TABLE if getattr(parse_config("").calibration, name).estimate == AUTO]
+    automatic = [n for n, e in parse_config("").calibration if e.estimate == AUTO]
     assert sorted(automatic) == sorted(LASTING)
 
 

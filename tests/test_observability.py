@@ -26,7 +26,7 @@ from rovgraph.inference.observability import (
 from rovgraph.lab.choices import goals, read_known
 from rovgraph.lab.observability import examined, in_words, observe, solved
 from rovgraph.lab.plan import KnownComponents, Manoeuvre, SensorRates, manoeuvres, plan, predicted
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import LAYERS, TABLE
 from rovgraph.model.config import Config
 from rovgraph.model.state import State
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
@@ -349,7 +349,7 @@ def test_observe_refuses_a_log_that_is_too_short(recorded, monkeypatch, tmp_path
 
 
 def test_observe_refuses_where_nothing_is_estimated():
-    held = {name: {"estimate": False} for name in TABLE}
+    held = {name: {"estimate": False} for name in TABLE if name not in LAYERS}
     config = changed(ONE_COMPASS, calibration=held)
     case = simulated(config, 40.0, 1, "straight", **SLOW)
     with pytest.raises(InputError, match="no calibration variable is estimated"):

@@ -10,7 +10,7 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -148,16 +148,20 @@ class Dive:
 
 
 Inspection = Callable[[Path, Dive], dict[str, float]]
+NO_TABLES: Mapping[str, pd.DataFrame] = {}
 
 
-def run_dive(dive: Dive, online: bool = False, inspect: Inspection | None = None) -> Result:
+def run_dive(
+    dive: Dive, online: bool = False, inspect: Inspection | None = None, beside: Mapping[str, pd.DataFrame] = NO_TABLES
+) -> Result:
     """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth.
 
-    ``inspect`` reads more from the folder, in which out/ and live/ are the results of these commands.
+    ``inspect`` reads more from the folder, in which out/ and live/ are the results of these commands; ``beside`` are
+    tables that lie beside the log, by name.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_dive(dive, folder)
+        write_dive(dive, folder, beside)
         result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
         if dive.second_file or (online and not result.refused):
             result = _online(folder, dive, result)
@@ -166,8 +170,10 @@ def run_dive(dive: Dive, online: bool = False, inspect: Inspection | None = None
         return replace(result, said=tuple(line.replace(name, "") for line in result.said))
 
 
-def write_dive(dive: Dive, folder: Path) -> None:
-    """Write log.csv and vehicle.yaml; second.csv where some sensors have a file of their own."""
+def write_dive(dive: Dive, folder: Path, beside: Mapping[str, pd.DataFrame] = NO_TABLES) -> None:
+    """Write log.csv and vehicle.yaml, tables beside it, and second.csv where some sensors have a file of their own."""
+    for name, table in beside.items():
+        table.to_csv(folder / f"log.{name}.csv", index=False, float_format="%.10g")
     (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
     first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
     _write(first, folder / "log.csv")

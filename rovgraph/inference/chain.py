@@ -22,10 +22,11 @@ from rovgraph.inference.gauss_newton import GatedMeasurements, Gates
 from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
 from rovgraph.kernels.elimination import DiveFactors, eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE, TIME
-from rovgraph.model.calibration import LAYOUT, TABLE, Belief, calibration_size
+from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, WATER_LAYER, Belief, calibration_size
 from rovgraph.model.state import BIAS, POSE, VELOCITY, State
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.layers import OUT_OF_SIGHT, NewKnot, conditional, new_knots, window_changes
 from rovgraph.problem.measurements import (
     Measurements,
     Seen,
@@ -114,7 +115,8 @@ class ChainLayout:
 
 
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
-PRIORS = 3  # rows at the first keyframe other than measurements: two priors, and the tie of its clone
+CONDITIONALS = 3  # place of rows of new knots, after those at the first keyframe: two priors, and its clone's tie
+PRIORS = 4  # such rows that are no measurements
 STIFF = 1e8  # square-root information that ties the clone to it [1/rad]
 
 NEWEST = 2  # points whose costs are kept: the last, and the one before it if that was better
@@ -175,7 +177,53 @@ class Chain:
             kept[:, self._walking(name)], sd[:, self._walking(name)] = of_walk
             ends = self.problem.time.searchsorted(self.beliefs[name].changes)  # of the intervals that hold changes
             sd[ends[(ends > 0) & (ends < len(self.problem.time))] - 1, self._walking(name)] = self.beliefs[name].sd
+        for k, knots in self._windows:
+            for knot in knots:
+                sd[k - 1, self._walking(knot.name)] = OUT_OF_SIGHT
         return 1.0 / sd, kept
+
+    @cached_property
+    def _windows(self) -> list[tuple[int, list[NewKnot]]]:
+        """Keyframes at which knots of the water's current are new, and these."""
+        if WATER_LAYER not in self.initial.instruments or LAYERS[0] not in self.layout.places:
+            return []
+        count = self.initial.config.water.knots or len(LAYERS)
+        changes = [(k, new_knots(self.problem, k, count)) for k in window_changes(self.problem).tolist()]
+        return [(k, knots) for k, knots in changes if knots]
+
+    @cached_property
+    def _conditionals(self) -> tuple[NDArray[np.int64], Array]:
+        """Whitened rows by which new knots follow from their neighbours: keyframe, Jacobian by what walks.
+
+        Shapes (r,), (r, d - 15); their residual is the Jacobian times what walks.
+        """
+        kept, sd = conditional(self.initial.config)
+        alone = self.initial.config.water.current_sd_mps
+        keyframe, rows = [], [np.empty((0, self.layout.d - MOTION))]
+        for k, knots in self._windows:
+            for knot in knots:
+                row = np.zeros((2, self.layout.d - MOTION))
+                row[:, self._walking(knot.name)] = np.eye(2) / (alone if knot.neighbour is None else sd)
+                if knot.neighbour is not None:
+                    row[:, self._walking(knot.neighbour)] = -kept * np.eye(2) / sd
+                rows.append(row)
+                keyframe += [k, k]
+        return np.array(keyframe, np.int64), np.concatenate(rows)
+
+    def _conditional_residuals(self, point: State) -> Array:
+        """Whitened residuals of new knots, shape (r,)."""
+        keyframe, rows = self._conditionals
+        if not len(keyframe):
+            return np.empty(0)
+        walking = np.concatenate([point.calibration[name][keyframe] for name in self.layout.walking], axis=1)
+        return np.asarray(np.sum(rows * walking, axis=1))
+
+    def _put_conditionals(self, rows: MeasurementRows, place: int, point: State) -> None:
+        keyframe, by = self._conditionals
+        if len(keyframe):
+            targets = np.concatenate([self.layout.target(name) for name in self.layout.walking])
+            r, J = -self._conditional_residuals(point)[:, None], np.zeros((len(keyframe), 1, MOTION))
+            rows.put(place, r, J, by[:, None], targets, np.ones(len(keyframe)))
 
     def _walking(self, name: str) -> slice:
         part = self.layout.places[name][1]
@@ -260,6 +308,7 @@ class Chain:
             cost = 0.5 * float(np.vdot(motions, motions))
             cost += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
             cost += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
+            cost += 0.5 * float(np.sum(self._conditional_residuals(point) ** 2))
             cost -= self._lacking(point)
             known = _PointCosts(ref(point), cost, self._squared_lengths(point))
             self._newest.append(known)
@@ -382,6 +431,7 @@ class Chain:
         """
         given, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
         self._put_priors(given, point, clones)
+        self._put_conditionals(given, CONDITIONALS, point)
         for place, (sensor, block) in enumerate(self.given.items(), PRIORS):
             self._put_block(given, place, block, point, gates[sensor])
         n, d, c = len(self.problem), self.layout.d, self.layout.c + clones
@@ -410,8 +460,8 @@ class Chain:
         """Buffers for the rows of priors, of the clone's tie and of sensors without a kernel, in this order."""
         blocks, first = self.given.values(), np.zeros(1, np.int64)
         walking = self.layout.d - MOTION
-        keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
-        dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
+        keyframes = [first, first, first, self._conditionals[0], *(b.keyframe.astype(np.int64) for b in blocks)]
+        dims = [MOTION, walking, clones, 1, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.problem), MOTION, keyframes, dims, max([walking, clones, *others]))
 

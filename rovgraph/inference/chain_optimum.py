@@ -13,7 +13,7 @@ import numpy as np
 
 from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.inference import gauss_newton
-from rovgraph.inference.chain import CLONED, COLUMNS, MOTION, NOTHING, Chain, ChainStep
+from rovgraph.inference.chain import CLONED, COLUMNS, CONDITIONALS, MOTION, NOTHING, Chain, ChainStep
 from rovgraph.inference.chain_information import MeasurementRows, SquareRoot
 from rovgraph.inference.faulty_intervals import Searches, converged, resume, solve
 from rovgraph.inference.gauss_newton import Gates, GaussNewtonResult, left_after, whole_share
@@ -125,7 +125,8 @@ class _HeadedChain(Chain):
 
     def _room(self, clones: int) -> MeasurementRows:
         size = len(self.head)
-        return MeasurementRows(len(self.problem), MOTION, [np.zeros(1, np.int64)], [size], size - MOTION)
+        keyframes = [np.zeros(1, np.int64), *(np.empty(0, np.int64),) * (CONDITIONALS - 1), self._conditionals[0]]
+        return MeasurementRows(len(self.problem), MOTION, keyframes, [size, 0, 0, 1], size - MOTION)
 
     def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
         r, _ = self.prior_residuals(point)

@@ -342,11 +342,12 @@ class ErrorStateFilter:
         compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in problem.sensors)
         while (k := len(self.history)) < n:
             progress(k / n)
-            end = min(k + PROGRESS_EVERY, self._due_at(problem.time, k))
+            window = self.engine.next_window(problem, k)
+            end = min(k + PROGRESS_EVERY, self._due_at(problem.time, k), max(window, k + 1))
             if self.engine.changes_in(problem.time[max(k - 1, 0)], problem.time[end - 1]):
                 end = k + 1
             # of a filter that is not reinitialised, the smoother needs every step
-            alone = k > 0 and compiled and self.reinitialise_at and not self.known.places
+            alone = 0 < k < window and compiled and self.reinitialise_at and not self.known.places
             if alone and not self.engine.changes_in(problem.time[k - 1], problem.time[end - 1]):
                 run = self.engine.run(problem, k, end, self.known, self.gates)
                 self.known = run.known

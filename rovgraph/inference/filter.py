@@ -69,10 +69,11 @@ from rovgraph.kernels.filtering import (
 )
 from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.measurement_row import MeasuredRows
-from rovgraph.model.calibration import LAYOUT, TABLE, calibration_size
+from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, WATER_LAYER, calibration_size
 from rovgraph.model.state import DIMENSION, PLACE, PLACE_DIM, Jacobians
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.layers import NewKnot, conditional, new_knots, window_changes
 from rovgraph.problem.measurements import KeyframeRows, Measurements, compiled, sensor_table
 from rovgraph.problem.problem import Index, Problem
 from rovgraph.sensors import SENSORS, CompiledModel, SensorModel, WaterVelocity
@@ -320,14 +321,14 @@ class FilterEngine:
         if k > 0:
             departed = self._align(before, problem, k)
             departed = self.correct(departed, problem, slice(met.begin, here), gates, met)
-            transition = self.predict(problem, k, self._changed(departed, problem, k))
+            transition = self._predict_changed(problem, k, departed)
             predicted = transition.predicted
         filtered = self.correct(predicted, problem, slice(here, met.end), gates, met)
         return FilterStep(filtered, met, departed, transition)
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
         """Whether kernels can take the whole interval that ends with keyframe k."""
-        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k):
+        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k) or self._new_knots(problem, k):
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
 
@@ -484,6 +485,16 @@ class FilterEngine:
         B[columns(size, ours)] = extended(basis, size + PLACE_DIM * len(ours)) @ other.B[columns(size, theirs)]
         return replace(known, B=B, L=other.L)
 
+    def next_window(self, problem: Problem, k: int) -> int:
+        """The first keyframe from k on at which knots of the water's current are new, or how many keyframes there are.
+
+        The kernels take the intervals before it.
+        """
+        if WATER_LAYER not in self.initial.instruments:
+            return len(problem)
+        changes = window_changes(problem)
+        return int(np.append(changes, len(problem))[changes.searchsorted(k)])
+
     def changes_in(self, begin: float, end: float) -> list[str]:
         """Calibration variables whose value changes after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
@@ -502,6 +513,34 @@ class FilterEngine:
             index = np.arange(len(P))[self.layout.columns[name]]
             P[index, index] += self.beliefs[name].sd ** 2
         return replace(known, P=P)
+
+    def _new_knots(self, problem: Problem, k: int) -> list[NewKnot]:
+        """Knots of the water's current that are new at keyframe k."""
+        if WATER_LAYER not in self.initial.instruments:
+            return []
+        return new_knots(problem, k, self.initial.config.water.knots or len(LAYERS))
+
+    def _predict_changed(self, problem: Problem, k: int, departed: Gaussian) -> Transition:
+        """`predict`, of variables whose value changes, and of knots that take the place of others."""
+        known, knots = self._changed(departed, problem, k), self._new_knots(problem, k)
+        if not knots:
+            return self.predict(problem, k, known)
+        n, (kept, sd) = len(known.P), conditional(self.initial.config)
+        alone, S, added, c = self.initial.config.water.current_sd_mps, np.eye(n), np.zeros((n, n)), known.c.copy()
+        for name, neighbour in knots:
+            place = self.layout.columns[name]
+            S[place], added[place], added[:, place] = 0.0, 0.0, 0.0
+            c[LAYOUT[name]] = 0.0
+            if neighbour is None:
+                added[place, place] = alone**2 * np.eye(place.stop - place.start)
+                continue
+            by = self.layout.columns[neighbour]
+            S[place], c[LAYOUT[name]] = kept * S[by], kept * c[LAYOUT[neighbour]]
+            added[place], added[:, place] = kept * added[by], kept * added[:, by]
+            added[place, place] = kept**2 * added[by, by] + sd**2 * np.eye(place.stop - place.start)
+        moved = replace(known, c=c, P=S @ known.P @ S.T + added, B=S @ known.B if known.B.size else known.B)
+        after = self.predict(problem, k, moved)
+        return replace(after, F=after.F @ S, Q=after.Q + after.F @ added @ after.F.T)
 
     def _align(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
         """The keyframe before keyframe k; where its attitude is poorly known, with the one it is corrected to."""

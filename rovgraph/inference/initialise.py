@@ -42,6 +42,7 @@ from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
+from rovgraph.problem.layers import layer_sensors, with_knots
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -490,9 +491,16 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     if beams:
         assumptions.append(f"pings of the DVL by their {len(beams) - 1} beams, at {config.dvl.beams.angle_deg:g} deg")
     assumptions += [why_not] if why_not else []
+    layers, why_not = layer_sensors(config, log.streams)
+    if layers:
+        config = with_knots(config, log.streams)
+        knots, spacing = config.water.knots, config.water.knot_m
+        said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        assumptions.append(f"profiles of the water are used; the current: {said}")
+    assumptions += [why_not] if why_not else []
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
-    sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams}
+    sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams, *layers}
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = _resolve_sound(log, config, assumptions)
     config = with_priors_stated(config, compass)

@@ -36,6 +36,7 @@ keyframe
 `BELIEVED`             2  densities of noise of accelerometer and gyro from here on [SI/rtHz]
 `SCATTER`              2  that the interval's samples show; nan = they show none
 `SIGHTED`              1  sightings of places up to it
+`FIRST_KNOT`           1  of the water's knots that are kept, the uppermost; of no kernel
 ==================  ====  ==========================================================================================
 """
 
@@ -66,7 +67,7 @@ from rovgraph.kernels.preintegration import SNAPSHOT as NUMBERS
 
 STAMP, PLACED, SENSOR, LINE, NAME, FATE, VALUES = 0, 1, 2, 3, 4, 5, 6
 TIME, COUNT, UPTO, HERE, SEGMENT, BEGUN, RATE_B, SPREAD, FIRST, LAST = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11
-TAKEN, BELIEVED, SCATTER, SIGHTED, KEYFRAME = 12, 13, 15, 17, 18
+TAKEN, BELIEVED, SCATTER, SIGHTED, FIRST_KNOT, KEYFRAME = 12, 13, 15, 17, 18, 19
 IN, EARLY, LATE, UNFINISHED, BEYOND, IN_VIEW, REFUSED = 0, 1, 2, 3, 4, 5, 6  # fates; of the last there may be more
 CLOSES, ONCE, TURNED, DIM, SIGHTS, LAG, ABOUT = 0, 1, 2, 3, 4, 5, 6  # of a sensor; LAG is its place in ``lags`` or -1
 SAMPLES, READ, ORDERED, KEYFRAMES, ROWS, WINDOWS, FORGOTTEN = 0, 1, 2, 3, 4, 5, 6  # counts

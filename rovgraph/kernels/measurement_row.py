@@ -40,6 +40,15 @@ context of a beam of a DVL
 =============  =====  ==========================================================================================
 
 =============  =====  ==========================================================================================
+context of a layer of the water
+=============  =====  ==========================================================================================
+`LAYER_ARM`        3  of the DVL, from the state's origin, b [m]
+`ABOVE_AT`, `BELOW_AT`  1, 1  places in the calibration vector of the water's velocity at the knots about the layer
+`SHARE`            1  of the knot below in the layer's velocity
+`FIRST_KNOT`       1  number of the uppermost knot that is kept, by its depth, or -1 where there is one for all depths
+=============  =====  ==========================================================================================
+
+=============  =====  ==========================================================================================
 sensor
 =============  =====  ==========================================================================================
 `KIND`             1  of `rovgraph.kernels.measurements`, or `PRELINEARISED`: linearised outside the kernels
@@ -88,6 +97,7 @@ MOUNT_AT, ARM_AT, BEACON_AT, DOWN_AT, SCALE_AT, OFFSET_AT, CLOCK_AT, DRIFT_AT, D
 )
 WIDTH = 44
 BEAM_ARM, BEAM, BEAM_TILT, ALTITUDE, BEAM_AT, BEAM_WIDTH = 0, 3, 6, 9, 10, 11
+LAYER_ARM, ABOVE_AT, BELOW_AT, SHARE, FIRST_KNOT, LAYER_WIDTH = 0, 3, 4, 5, 6, 7
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
 PRELINEARISED = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2

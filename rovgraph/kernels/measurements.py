@@ -12,6 +12,8 @@ DVL_WATER       the same with c for u, c the current, without e
 DVL_BEAM        z = (1 + k + e + s h) (d + a t) . u + d . f, u of DVL     Janus geometry:
                 without its scale, d the beam's direction, t how it goes   Gordon 1996 (RDI)
                 with its angle, h the altitude
+WATER_LAYER     DVL_WATER with (1 - f) c_i + f c_j for c, of the knots
+                above and below
 DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17); deviation
                 less the declination, e an error that lasts                curve: Bowditch
 COMPASS         the same, with an x axis that is known
@@ -40,6 +42,7 @@ at first can be used again and again:
     DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; dvl_error and
                      bottom_velocity, DVL_WATER: current
     DVL_BEAM         the same as DVL, dvl_bias, dvl_altitude_scale, and its angle
+    WATER_LAYER      the same as DVL_WATER, of water_layer_1 to the last or current
     DVL_COMPASS      rotation, its offset, error and curve, dvl_roll to dvl_yaw
     COMPASS          rotation, its offset, error and curve
     MAGNETOMETER     rotation, mag_offset to field_scale
@@ -95,8 +98,11 @@ from rovgraph.kernels.layout import (
     SOFT_IRON,
     TRANSLATION,
     VELOCITY,
+    WATER_LAYER_1,
+    WATER_LAYER_14,
 )
 from rovgraph.kernels.measurement_row import (
+    ABOVE_AT,
     ALTITUDE,
     ARM,
     ARM_AT,
@@ -106,6 +112,7 @@ from rovgraph.kernels.measurement_row import (
     BEAM_ARM,
     BEAM_AT,
     BEAM_TILT,
+    BELOW_AT,
     CLOCK_AT,
     DIRECTION_AT,
     DOWN_AT,
@@ -114,12 +121,14 @@ from rovgraph.kernels.measurement_row import (
     HEARD,
     INVERTED,
     LATE_AT,
+    LAYER_ARM,
     MOUNT_AT,
     MOVES,
     OFFSET_AT,
     RANGE_AT,
     SCALE_AT,
     SEEN,
+    SHARE,
     SINCE,
     STATED,
     TURNS,
@@ -272,7 +281,7 @@ def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, 
 
 
 DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY, TILT = range(9)
-ACOUSTIC, DVL_BEAM = 9, 10
+ACOUSTIC, DVL_BEAM, WATER_LAYER = 9, 10, 11
 WORK = 8  # matrices (3, 3) that `predict` needs to calculate with
 
 
@@ -285,7 +294,7 @@ def is_angular(kind: int) -> bool:
 @view_helper
 def has_context(kind: int) -> bool:
     """Whether its numbers come with each measurement, and not with the sensor."""
-    return kind in (ACOUSTIC, DVL_BEAM)
+    return kind in (ACOUSTIC, DVL_BEAM, WATER_LAYER)
 
 
 @view_helper
@@ -295,29 +304,51 @@ def dvl_velocity(
     """Velocity of the DVL in its own axes, over ground or relative to the water."""
     c = state.c
     R_bs, row, gain = work[0], work[3, 1], 1.0 + c[DVL_SCALE]
-    _dvl_motion(state, rate, params, CURRENT if water else BOTTOM_VELOCITY, work)
+    below = CURRENT if water else BOTTOM_VELOCITY
+    _dvl_motion(state, rate, params, c[below], c[below + 1], work)
     if not water:  # the bottom's slope is the bottom's
         gain += c[DVL_ERROR]
     for i in range(3):
         for k in range(3):
             row[k] = gain * R_bs[k, i]  # of (1 + k) R_sb
-        z_out[i] = _along(state, gain, CURRENT if water else BOTTOM_VELOCITY, H_out[i], work)
+        z_out[i] = _along(state, gain, below, H_out[i], work)
         if not water:
             H_out[i, MOTION + DVL_ERROR] = H_out[i, MOTION + DVL_SCALE]
 
 
 @view_helper
-def _dvl_motion(state: Epoch, rate: Array, arm_b: Array, below: int, work: Array) -> None:
+def water_layer(state: Epoch, rate: Array, x: Array, z_out: Array, H_out: Array, work: Array) -> None:
+    """Velocity of the DVL in its own axes, relative to a layer of the water, whose context is ``x``."""
+    c, above, below, share = state.c, int(x[ABOVE_AT]), int(x[BELOW_AT]), x[SHARE]
+    R_bs, row, gain = work[0], work[3, 1], 1.0 + c[DVL_SCALE]
+    for i in range(3):  # of the knots of other layers
+        for j in range(MOTION + WATER_LAYER_1, MOTION + WATER_LAYER_14 + 2):
+            H_out[i, j] = 0.0
+    north = (1.0 - share) * c[above] + share * c[below]
+    east = (1.0 - share) * c[above + 1] + share * c[below + 1]
+    _dvl_motion(state, rate, x[LAYER_ARM : LAYER_ARM + 3], north, east, work)
+    for i in range(3):
+        for k in range(3):
+            row[k] = gain * R_bs[k, i]
+        z_out[i] = _along(state, gain, above, H_out[i], work)
+        for k in range(2):
+            H_out[i, MOTION + above + k] *= 1.0 - share
+            if below != above:
+                H_out[i, MOTION + below + k] = -share * H_out[i, VELOCITY + k]
+
+
+@view_helper
+def _dvl_motion(state: Epoch, rate: Array, arm_b: Array, north: float, east: float, work: Array) -> None:
     """The DVL's mounting and velocity: ``work`` has R_bs, the axes of its angles, and in row 2 velocity of the state's
-    origin, rate and lever arm, in 3, 0 the DVL's velocity over what is ``below``, all in b."""
+    origin, rate and lever arm, in 3, 0 the DVL's velocity over what moves ``north`` and ``east``, all in b."""
     c, body, w, arm, v_b, row = state.c, work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1]
     dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], work[0], work[1])
     for i in range(3):
         w[i] = rate[i] - state.b[3 + i]
         arm[i] = arm_b[i] + c[DVL_LEVER_ARM + i]
         row[i] = state.v[i]
-    row[0] -= c[below]
-    row[1] -= c[below + 1]
+    row[0] -= north
+    row[1] -= east
     rotate_back(state.R, row, body)
     cross(w, arm, v_b)
     for i in range(3):
@@ -346,7 +377,8 @@ def _along(state: Epoch, gain: float, below: int, H_out: Array, work: Array) -> 
 def dvl_beam(state: Epoch, rate: Array, x: Array, z_out: Array, H_out: Array, work: Array) -> None:
     """Velocity of the DVL along one of its beams, whose context is ``x``, over ground."""
     c, R_bs, d, row = state.c, work[0], work[4, 0], work[3, 1]
-    _dvl_motion(state, rate, x[BEAM_ARM : BEAM_ARM + 3], BOTTOM_VELOCITY, work)
+    north, east = c[BOTTOM_VELOCITY], c[BOTTOM_VELOCITY + 1]
+    _dvl_motion(state, rate, x[BEAM_ARM : BEAM_ARM + 3], north, east, work)
     gain, angle, along = 1.0 + c[DVL_SCALE] + c[DVL_ERROR] + x[ALTITUDE] * c[DVL_ALTITUDE_SCALE], 0.0, 0.0
     if x[BEAM_AT] >= 0.0:
         angle = c[int(x[BEAM_AT])]
@@ -602,6 +634,8 @@ def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H
         acoustic(state, params, z_out, H_out, work)
     elif kind == DVL_BEAM:
         dvl_beam(state, rate, params, z_out, H_out, work)
+    elif kind == WATER_LAYER:
+        water_layer(state, rate, params, z_out, H_out, work)
 
 
 @kernel()

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.errors import InputError, collected_warnings, warn
+from rovgraph.log.adcp import cells_beside
 from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams, with_sound_speed
 from rovgraph.log.rows import Rows, tables_of
@@ -173,15 +174,34 @@ class Log:
         """
         if beams is None:
             return self
-        config = config_or_defaults(self.config)
-        first, last = float(beams.time[0]), float(beams.time[-1])
+        joined = self._with(beams, "the DVL's beams")
+        if BEAMS not in joined:
+            return joined
+        found, config = {BEAMS: beams}, config_or_defaults(self.config)
+        return replace(joined, streams={**joined.streams, **with_sound_speed(found, self.streams, config)})
+
+    def with_profiles(self, cells: Stream | None) -> "Log":
+        """The log with profiles of the water beside its other streams.
+
+        Parameters
+        ----------
+        cells : of `rovgraph.log.adcp`, by the log's clock; None = not known
+
+        Warns
+        -----
+        DataWarning : profiles of another time than the log's; they are left out
+        """
+        return self if cells is None else self._with(cells, "profiles of the water")
+
+    def _with(self, stream: Stream, what: str) -> "Log":
+        """The log with a stream of a table beside it."""
+        first, last = float(stream.time[0]), float(stream.time[-1])
         if first <= self.end and last >= self.start:
-            found = {BEAMS: beams}
-            return replace(self, streams={**self.streams, **found, **with_sound_speed(found, self.streams, config)})
+            return replace(self, streams={**self.streams, stream.sensor: stream})
         with collected_warnings() as texts:
             warn(
-                f"{self.source}: the DVL's beams have times from {first:.1f} to {last:.1f} s, the log from "
-                f"{self.start:.1f} to {self.end:.1f} s; the beams are left out; convert the native files again"
+                f"{self.source}: {what} have times from {first:.1f} to {last:.1f} s, the log from {self.start:.1f} to "
+                f"{self.end:.1f} s; they are left out; convert the native files again"
             )
         return replace(self, warnings=(*self.warnings, *texts))
 
@@ -217,7 +237,7 @@ class Log:
 
 
 def read_log(path: Path | str, config: Config | None = None) -> Log:
-    """Read a log, and what each beam of its DVL measured where ``log.dvl_beams.csv`` lies beside it.
+    """Read a log, and what lies beside it: each beam of its DVL in ``log.dvl_beams.csv``, profiles in ``log.adcp.csv``.
 
     Parameters
     ----------
@@ -236,7 +256,8 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     with collected_warnings() as texts:
         table = read_table(path)
         beams = beams_beside(Path(path), config_or_defaults(config))
-    return _log([table], config, table.source, texts).with_beams(beams)
+        cells = cells_beside(Path(path), config_or_defaults(config))
+    return _log([table], config, table.source, texts).with_beams(beams).with_profiles(cells)
 
 
 def _log(tables: Iterable[Table], config: Config | None, source: str, before: Iterable[str] = ()) -> Log:

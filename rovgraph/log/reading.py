@@ -48,6 +48,7 @@ from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.pressure import complaints, depths
+from rovgraph.sensors.water_layer import CELLS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
@@ -170,9 +171,9 @@ def water_at(time: Array, streams: Mapping[str, Stream]) -> WaterState:
 
 
 def delay_of(config: Config, sensor: str) -> float:
-    """How much older a sensor's measurements are than their stamps [s]; beams of a DVL are stamped as its pings."""
+    """How much older a sensor's measurements are than their stamps [s]; beams and profiles of a DVL as it is."""
     delays: Mapping[str, float] = config.delay_s
-    return delays.get(sensor, delays.get("dvl", 0.0) if sensor == BEAMS else 0.0)
+    return delays.get(sensor, delays.get("dvl", 0.0) if sensor in (BEAMS, CELLS) else 0.0)
 
 
 def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, Stream], Origin]:
@@ -328,7 +329,11 @@ def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool
             raise InputError(f"{source}: column time is empty, expected seconds in every row")
         warn(f"{source}: {timeless.sum()} rows without time left out, first in line {line[np.argmax(timeless)]}")
         cells, line = {name: values[~timeless] for name, values in cells.items()}, line[~timeless]
-    time, said = mend(cells["time"], source, line, LATE if by_arrival else STEP_BACK)
+    time, rows = cells["time"], np.arange(len(line))
+    if "adcp_range" in cells:  # the cells of a profile are of one time
+        rows = np.flatnonzero(np.diff(time, prepend=np.nan) != 0.0)
+    time, said = mend(time[rows], source, line[rows], LATE if by_arrival else STEP_BACK)
+    time = np.repeat(time, np.diff(rows, append=len(line)))
     for text in said:
         warn(text)
     if not (usable := np.isfinite(time)).all():
@@ -533,8 +538,10 @@ def _interpolated(at: Array, time: Array, values: Array) -> tuple[Array, Bools]:
 def _distinct_times(stream: Stream, source: str) -> Stream:
     """A stream with one measurement at a time, the first; those within `SPACING_S` are of one time.
 
-    What is measured of several beacons or places at a time is kept.
+    What is measured of several beacons or places at a time is kept, and all cells of a profile of the water.
     """
+    if stream.sensor == CELLS:
+        return stream
     names = [stream.columns.index(name) for name in stream.columns if name in labels()]
     if names:
         of = np.unique(np.nan_to_num(stream.data[:, names], nan=-1.0), axis=0, return_inverse=True)[1].ravel()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.model.calibration import BEAM_SENSORS
+from rovgraph.model.calibration import BEAM_SENSORS, WATER_LAYER
 from rovgraph.sensors import SENSORS
 
 
@@ -161,4 +161,4 @@ def arrivals(streams: Sequence[Stream]) -> tuple[NDArray[np.int64], NDArray[np.i
 
 def precedence(sensor: str) -> int:
     """Place among measurements of one time."""
-    return {"imu": 0, "dvl": 1}.get(sensor, 1 if sensor in BEAM_SENSORS else 2)
+    return {"imu": 0, "dvl": 1}.get(sensor, 1 if sensor in (*BEAM_SENSORS, WATER_LAYER) else 2)

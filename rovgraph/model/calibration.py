@@ -159,6 +159,8 @@ _CONTROL = "".join(
     map(chr, range(1, 12))
 )  # letters of what beams of a DVL need; printable ones are for sensors outside
 _MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
+WATER_LAYER = "water_layer"  # sensor: the water's velocity as profiles of cells show it
+LAYERS = tuple(f"water_layer_{k + 1}" for k in range(14))  # knots of the current's profile that are kept at a time
 
 
 def beacon_names(k: int) -> tuple[str, str]:
@@ -625,6 +627,21 @@ TABLE: dict[str, Variable] = {
             "scale error of the DVL by its altitude, as wide beams have it (absorption and slant over the footprint)",
             "position fixes at different altitudes",
             considered=True,
+        ),
+        *(
+            Variable(
+                name,
+                chr(12 + k),
+                ("_north", "_east"),
+                "m/s",
+                0.3,
+                (WATER_LAYER,),
+                f"velocity of the water over ground at knot {k + 1} of those about the vehicle's depth",
+                "bottom track or position fixes beside a profile of the water, and profiles that overlap",
+                estimate=True,
+                walk=5e-4,
+            )
+            for k, name in enumerate(LAYERS)
         ),
     )
 }

@@ -36,9 +36,11 @@ from rovgraph.model.calibration import (
     AUTO,
     BEACONS,
     CONSIDERED,
+    LAYERS,
     MOUNT,
     TABLE,
     USBL_MOUNT,
+    WATER_LAYER,
     Belief,
     Variable,
     beacon_names,
@@ -80,6 +82,7 @@ from rovgraph.model.config_sections import (
     Triple,
     Usbl,
     Vehicle,
+    Water,
 )
 from rovgraph.model.gauss_markov import stationary_walk
 from rovgraph.model.presets import with_presets, without_presets
@@ -223,7 +226,7 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     return entry
 
 
-_ENTRIES = {name: calibration_entry(v) for name, v in TABLE.items()}
+_ENTRIES = {name: calibration_entry(v) for name, v in TABLE.items() if name not in LAYERS}  # which `Water` is about
 Calibration: type[BaseModel] = create_model(
     "Calibration",
     __base__=ConfigSection,
@@ -280,6 +283,7 @@ class Config(ConfigSection):
     depth: Depth = Depth()
     fix: Fix = Fix()
     place: Place = Place()
+    water: Water = Water()
     usbl: Usbl = Usbl()
     range: RangeSettings = RangeSettings()
     ship: ShipSettings = ShipSettings()
@@ -442,7 +446,8 @@ def beliefs(config: Config) -> dict[str, Belief]:
     mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
     mount |= dict(zip(USBL_MOUNT, config.usbl.mount_rpy_deg, strict=True))
     out = {}
-    for name, variable in TABLE.items():
+    for name in _ENTRIES:
+        variable = TABLE[name]
         entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
         unit = float(np.deg2rad(1.0)) if variable.angular else 1.0
         mean = getattr(entry, "mean" + tail)
@@ -468,6 +473,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
     unused = ("range_offset",) if config.range.one_way else ("range_clock", "range_clock_drift")
     for name in (*unused, *(v for k in range(len(config.beacons), BEACONS) for v in beacon_names(k))):
         out[name] = replace(out[name], streams=())
+    out |= _of_water(config, out["current"])
     for k, beacon in enumerate(config.beacons):
         place, down = beacon_names(k)
         out[place], out[down] = replace(out[place], streams=shown), replace(out[down], streams=shown)
@@ -481,6 +487,16 @@ def beliefs(config: Config) -> dict[str, Belief]:
 
 
 KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
+
+
+def _of_water(config: Config, current: Belief) -> dict[str, Belief]:
+    """Priors of the current: one for all depths, or at knots."""
+    water, knots = config.water, config.water.knots or len(LAYERS)
+    at_knots = (TABLE[name] for name in LAYERS)
+    out = {v.name: Belief(v, np.zeros(v.dim), water.current_sd_mps, True, water.walk_mps) for v in at_knots}
+    if knots == 1:
+        out["current"] = replace(current, streams=(*TABLE["current"].sensors, WATER_LAYER))
+    return out | {name: replace(out[name], streams=()) for name in LAYERS[knots if knots > 1 else 0 :]}
 
 
 def _sd_follows(name: str, config: Config) -> bool:
@@ -503,7 +519,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     names : calibration variables that are stated; None = all
     """
     given, entries = config.calibration, {}
-    for name in TABLE if names is None else names:
+    for name in _ENTRIES if names is None else names:
         variable, entry = TABLE[name], getattr(given, name)
         key = "sd_deg" if variable.angular else "sd"
         if getattr(entry, key) is None or _sd_follows(name, config):

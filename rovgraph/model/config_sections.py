@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
 from rovgraph.geometry import normal_gravity
+from rovgraph.model.calibration import LAYERS
 from rovgraph.model.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
@@ -37,7 +38,7 @@ STAMPED = (
         "dvl_water",
         "dvl_sound",
     ),
-    *("dvl_beams", "depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
+    *("dvl_beams", "adcp", "depth", "fix", "place", "thruster", "usbl", "range", "ship", "ship_heading", "ship_tilt"),
 )
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
@@ -272,6 +273,33 @@ class Dvl(ConfigSection):
     gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is rejected; null = never")
     readmit_s: Readmission = 2.0
     max_speed_mps: Positive = Field(3.0, description="faster pings are ignored")
+
+
+class Water(ConfigSection):
+    """Profiles of the water that the DVL measures, and the current as a function of depth (docs/water.md)."""
+
+    use: bool = Field(True, description="false = profiles are left out")
+    looks: Literal["down", "up"] = Field("down", description="whether its cells are below or above the DVL")
+    knots: Annotated[int, Field(ge=1, le=len(LAYERS))] | None = Field(
+        None,
+        description="knots of the current that are kept about the vehicle's depth; null = as many as the log's cells "
+        "reach over; 1 = one current for all depths, calibration.current",
+    )
+    knot_m: Positive = Field(10.0, description="depth from one knot to the next, at least")
+    current_sd_mps: Positive = Field(0.3, description="sd of the current at any depth, north and east")
+    correlation_m: Positive = Field(60.0, description="depth over which the correlation of the current falls to 1/e")
+    walk_mps: Positive = Field(5e-4, description="random walk of the current at a knot [m/s/rts]")
+    cell_sd_mps: PositiveTriple = Field(
+        (0.05, 0.05, 0.02), description="noise of a cell's velocity, DVL axes; sd of the table takes precedence"
+    )
+    cell_correlation: Annotated[float, Field(ge=0, lt=0.5)] = Field(
+        0.15, description="correlation of neighbouring cells, by which their noise is widened"
+    )
+    beam_angle_deg: Annotated[float, Field(gt=0, lt=60)] | None = Field(
+        None,
+        description="of the beams from the DVL's axis: the last cells before the bottom or the surface see it by their "
+        "side lobes; null = by dvl.beams, else 30",
+    )
 
 
 class Heading(ConfigSection):

@@ -23,11 +23,11 @@ from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.measurement_row import BEAM_WIDTH, KNOT, MOST, WIDTH, Z
+from rovgraph.kernels.measurement_row import BEAM_WIDTH, FIRST_KNOT, KNOT, LAYER_WIDTH, MOST, WIDTH, Z
 from rovgraph.kernels.preintegration import HALF_WINDOW_S
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
-from rovgraph.model.calibration import ACOUSTICS, Belief
+from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.model.state import PLACE
 from rovgraph.problem.acoustics import SHIP, Acoustics
@@ -35,12 +35,14 @@ from rovgraph.problem.admission import TimeOffsets, admitted, pack, thruster_pie
 from rovgraph.problem.beams import BY_BEAMS, ONE_PING_S, PingsByBeams
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
+from rovgraph.problem.layers import WaterLayers, put_windows
 from rovgraph.problem.motion import has_constant_velocity, preintegration_params, ticks, wanted
 from rovgraph.problem.problem import Problem, in_body
 from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.sensors.dvl_beam import BEAMS, Refusals
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import of_instrument
+from rovgraph.sensors.water_layer import CELLS
 
 KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
 BUFFER = 64  # rows of an array to begin with
@@ -102,10 +104,12 @@ class Assembly:
         self._most = max([MOST, *dims])
         self._acoustics = Acoustics(self.config, self.instruments)
         self._beams = PingsByBeams(self.config, self.instruments)
+        self._layers = WaterLayers(self.config, WATER_LAYER in self.instruments)
         # sensors whose measurements are made before they are events, with components, sds, context and name
-        self._made = {*self._acoustics.instruments, *self._beams.instruments}
+        self._made = {*self._acoustics.instruments, *self._beams.instruments, WATER_LAYER}
         self._sensors = np.array([self._about(s) for s in self.names], np.int64).reshape(-1, at.ABOUT)
-        self._context = WIDTH if self._acoustics.instruments else BEAM_WIDTH if self._beams.instruments else 0
+        beside = max(BEAM_WIDTH * bool(self._beams.instruments), LAYER_WIDTH * self._layers.used)
+        self._context = WIDTH if self._acoustics.instruments else beside
         self._wide = 2 * self._most + self._context  # components, sds and context of a measurement
         self._rule = self._make_rule(believed)
         self._integration = self._make_integration()
@@ -160,6 +164,7 @@ class Assembly:
             rows = zip(signals.time.tolist(), signals.data, signals.row.tolist(), strict=True)
             self._signals = [Measurement(t, "thruster", values, row) for t, values, row in rows]
         admissible, by_beams = self._beams.of_log(log.streams)
+        admissible += self._layers.of_log(log.streams, self._imu[:0] if self._no_imu else self._imu, self._left_out)
         for sensor, stream in streams.items():
             mask = admitted(sensor, stream.data, self.config, self._left_out)
             if sensor == "dvl":
@@ -193,9 +198,33 @@ class Assembly:
             return self._insert_acoustic(m, settled)
         if m.sensor in self._acoustics.signals:
             self._acoustics.take_one(m)
+        if self._layers.used:
+            self._insert_cells(m)
+            if m.sensor == CELLS:
+                return InsertResult.IN
         if self._beams.instruments and m.sensor in (BEAMS, "dvl"):
             return self._insert_ping(m)
         return self._insert(m)
+
+    def _insert_cells(self, m: Measurement) -> None:
+        """Keep a cell of a profile, or what is needed for one; take the profile when something later comes."""
+        layers = self._layers
+        if layers.waiting and m.time != layers.waiting[0].time:
+            cells, layers.waiting = layers.waiting, []
+            time, data, row = (np.array([c[k] for c in cells]) for k in (0, 2, 3))
+            events = self._events
+            before = np.flatnonzero(
+                (events[:, at.SENSOR] == self._which[WATER_LAYER]) & (events[:, at.STAMP] <= time[0])
+            )
+            first = int(events[before[-1], -self._context + FIRST_KNOT]) if len(before) else None
+            imu = self._table[:0] if self._no_imu else self._table
+            made = layers.of(Stream(CELLS, (), time, data, row), imu, first, self._left_out)
+            for t, values, line in zip(made.time.tolist(), made.data, made.row.tolist(), strict=True):
+                self._insert(Measurement(t, WATER_LAYER, values, line))
+        if m.sensor == CELLS:
+            layers.waiting.append(m)
+        elif m.sensor in layers.signals:
+            layers.take_one(m)
 
     def _insert_ping(self, m: Measurement) -> InsertResult:
         """Take a ping by its beams or by its velocity, never by both."""
@@ -334,6 +363,10 @@ class Assembly:
                 names=_grown(dive.names, rows, more),
             )
         at.assemble(streams, pieces, self._rule, self._integration, self._dive, begin)
+        if self._layers.used:
+            dive, m = self._dive, int(self._dive.counts[at.ROWS])
+            layer = self._which[WATER_LAYER]
+            put_windows(dive.keyframes[:n], dive.rows[:m], dive.of[:, :m], layer, begin, self._context)
 
     def truncate(self, n: int) -> None:
         """Unmake the keyframes from ``n`` on; what they were made of is looked at again."""
@@ -544,7 +577,7 @@ class Assembly:
         table, events, twin = self._table, self._events, copy(self)
         twin._imu, twin._listed, twin._order = table.copy(), events.copy(), self._order.copy()
         twin._fresh, twin._waiting, twin._signals, twin._no_pieces = [], [], self._signals[:], self._no_pieces[:]
-        twin._acoustics, twin._beams = self._acoustics.copy(), copy(self._beams)
+        twin._acoustics, twin._beams, twin._layers = self._acoustics.copy(), copy(self._beams), self._layers.copy()
         twin._left_out, twin._dive = self._left_out.copy(), at.DiveArrays._make(array.copy() for array in self._dive)
         return twin
 
@@ -649,7 +682,7 @@ class Assembly:
 
     def _closes(self, sensor: str) -> bool:
         """Whether a keyframe stands where a sensor measures."""
-        return self._no_imu or sensor == "dvl" or sensor in self._beams.instruments
+        return self._no_imu or sensor in ("dvl", WATER_LAYER) or sensor in self._beams.instruments
 
     def _about(self, sensor: str) -> list[int]:
         """Parameters of a sensor for the kernels."""
@@ -845,7 +878,7 @@ def _time(m: Measurement) -> float:
 
 
 def _name(m: Measurement) -> float:
-    """Of a place that is seen or of the other end of an acoustic exchange, else 0."""
-    if m.sensor in ACOUSTICS:
+    """Of a place that is seen, of the other end of an acoustic exchange or of a layer of a profile, else 0."""
+    if m.sensor in ACOUSTICS or m.sensor == WATER_LAYER:
         return float(m.values[-1])
     return float(m.values[0]) if m.sensor == PLACE else 0.0

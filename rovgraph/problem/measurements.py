@@ -31,7 +31,7 @@ from rovgraph.model.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY, Jacobia
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.motion import COLUMNS, SCALES
 from rovgraph.problem.problem import Index, Problem
-from rovgraph.sensors import SENSORS, AcousticExchange, DvlBeam, SensorModel, innovation
+from rovgraph.sensors import SENSORS, AcousticExchange, DvlBeam, SensorModel, WaterLayer, innovation
 from rovgraph.sensors.instruments import Instrument
 
 Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are admitted
@@ -209,7 +209,8 @@ class Measurements:
     def model(self) -> SensorModel:
         """Their model, with what was known of the other ends, or of the beams."""
         model = self.instrument.model
-        return model.of(self.problem.contexts(self.index)) if isinstance(model, AcousticExchange | DvlBeam) else model
+        with_context = isinstance(model, AcousticExchange | DvlBeam | WaterLayer)
+        return model.of(self.problem.contexts(self.index)) if with_context else model
 
     # predictions
 

@@ -32,6 +32,7 @@ from rovgraph.sensors.sensor import (
     unregister,
 )
 from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
+from rovgraph.sensors.water_layer import ADCP, LAYER, WaterLayer
 
 __all__ = [
     "DEFAULT_DIP",
@@ -55,6 +56,7 @@ __all__ = [
     "Sensor",
     "SensorModel",
     "Tilt",
+    "WaterLayer",
     "WaterVelocity",
     "dvl_mounting",
     "evaluate",
@@ -83,7 +85,7 @@ IMU = Sensor(  # it carries the estimate from one measurement to the next
 )
 
 _VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
-_DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DVL_SOUND, DVL_BEAMS, *SINGLE_BEAMS
+_DVL = DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DVL_SOUND, DVL_BEAMS, *SINGLE_BEAMS, ADCP, LAYER
 _ACOUSTIC = USBL, RANGE, SHIP, SHIP_HEADING, SHIP_TILT
 for _sensor in (IMU, MAG, AHRS, *_VEHICLE, *_DVL, DEPTH, PRESSURE, FIX, SEEN_PLACE, *_ACOUSTIC, THRUSTER):
     SENSORS[_sensor.name] = _sensor

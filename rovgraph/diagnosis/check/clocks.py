@@ -34,6 +34,7 @@ from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
+from rovgraph.sensors.water_layer import CELLS
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
@@ -46,7 +47,7 @@ SURE = 3.0  # standard deviations
 SMALL_S = 0.05  # difference of gap and jump up to which no samples are missing [s]
 CLOCKED = {  # by one clock
     "imu": ("imu", "mag", "ahrs"),
-    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", "dvl_sound", BEAMS),
+    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", "dvl_sound", BEAMS, CELLS),
 }
 NAMES = {"imu": "IMU", "dvl": "DVL"}
 
@@ -245,8 +246,14 @@ BATCHED = 0.5  # share of measurements that have the stamp of another, beyond wh
 REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
 
 
+def _without_cells(stream: Stream) -> Stream:
+    """Of profiles of the water the first cell of each, which are of one time."""
+    return stream.take(np.diff(stream.time, prepend=-np.inf) > 0.0) if stream.sensor == CELLS else stream
+
+
 def timing(stream: Stream) -> Timing:
     """When the measurements of one sensor came."""
+    stream = _without_cells(stream)
     periods = np.diff(stream.time)
     data = told(stream)
     again = int((repeats(data) & ~np.isnan(data).all(axis=1)).sum())
@@ -313,7 +320,8 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
 
 def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -> Iterator[Finding]:
     """Rates, gaps, jitter and repeated samples; ``frozen`` are measurements that another check names."""
-    for sensor, stream in log.streams.items():
+    for sensor, every in log.streams.items():
+        stream = _without_cells(every)
         t = timing(stream)
         if np.isnan(t.rate):
             yield Finding(sensor, "warning", "only one measurement")

@@ -1,0 +1,204 @@
+"""Layers of the water against truth: descents to 500 m without bottom lock, by an independent simulator.
+
+    python benchmarks/water.py                                     every row, 20 seeds, and what layers cost
+    python benchmarks/water.py --rows "300 kHz" --seeds 3 --online
+
+prints a table in Markdown: what each row is about, with its target, what was found, and the horizontal rms error and
+NEES of the smoothed, filtered and online estimates. A dive lies at the surface with fixes, descends at 1 m/s and goes
+on for 30 m with bottom lock. The error of a filter at the bottom is that before lock.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from fault_campaign.campaign import merge
+from fault_campaign.instruments import sample
+from fault_campaign.judge import Dive, Result, estimate_cells, run_dive, write_dive
+from fault_campaign.motion import Motion, Profile, mounting
+from fault_campaign.vehicle import Dvl, configuration, make_vehicle
+from fault_campaign.water import Current, Profiler, draw, profiles
+
+from rovgraph.lab.executors import cores, starting, workers
+
+LOCK_M = 30.0  # of bottom track at the end
+TILT_SD = 0.2  # of the head's roll and pitch in the vehicle [deg]
+SURFACE_M = 5.0  # up to which depth fixes come
+
+
+@dataclass
+class Setting:
+    """A descent.
+
+    Attributes
+    ----------
+    profiler : None = no ADCP
+    surface_s : with fixes before the descent [s]
+    depth : that is reached [m]
+    lock : with bottom track for the last `LOCK_M`, and for the first 30 s
+    knots : of the configuration
+    """
+
+    profiler: Profiler | None = field(default_factory=Profiler)
+    surface_s: float = 600.0
+    depth: float = 500.0
+    fix_sd: float = 1.0
+    knots: int | None = None
+    grade: str = "mti"
+
+
+def make_dive(setting: Setting, seed: int) -> tuple[Dive, pd.DataFrame | None]:
+    """A dive and its profiles. A seed gives every setting the same current."""
+    rng = np.random.default_rng([29, seed])
+    deepest = setting.depth + 150.0
+    current: Current = draw(rng, deepest)
+    start, descent = setting.surface_s, setting.depth - 2.0
+    seconds = start + descent + 20.0
+    heading = Profile(rng.uniform(-np.pi, np.pi), ((60.0, 20.0, np.pi), (180.0, 20.0, -np.pi)), ((0.05, 45.0, 0.0),))
+    drift, small = Profile(0.0, (), ((0.1, 50.0, 1.0),)), Profile(0.0, (), ((0.02, 7.0, 2.0),))
+    down = Profile(0.0, ((start, 6.0, 1.0), (start + descent + 3.0, 6.0, -1.0)))
+    tilt = Profile(0.0, (), ((0.03, 9.0, 1.0),))
+    motion = Motion(seconds, heading, (drift, small, down), tilt, Profile(0.0, (), ((0.02, 8.0, 0.0),)), 2.0)
+    vehicle = make_vehicle(setting.grade, ("ahrs", "depth", "fix"))
+    tilted = tuple(rng.normal(0.0, TILT_SD, 2).tolist())
+    vehicle.dvl = Dvl(rate=2.0, mount_rpy_deg=(*tilted, 0.0), yaw_sd=0.3, scale_sd=0.003)
+    vehicle.ahrs = replace(vehicle.ahrs, offset_sd=0.5, curve_sd=0.3)
+    vehicle.fix = replace(vehicle.fix, rate=1.0, sd=setting.fix_sd)
+    stated = {"dvl_scale": {"estimate": True, "sd": 0.003}}
+    stated |= {f"dvl_{angle}": {"sd_deg": TILT_SD} for angle in ("roll", "pitch")}
+    config = merge(configuration(vehicle), {"calibration": stated, "dvl": {"mount_rpy_deg": [0.0, 0.0, 0.0]}})
+    config["start"] |= {"north_m": 0.0, "east_m": 0.0, "position_sd_m": 1.0}
+    streams, hidden = sample(motion, vehicle, rng)
+    bottom = motion.local(streams["dvl"]["time"].to_numpy())[:, 2] > setting.depth - LOCK_M
+    streams["dvl"].loc[~bottom, [f"dvl_v{axis}" for axis in "xyz"]] = np.nan
+    streams["dvl"]["dvl_valid"] = bottom.astype(float)
+    up = motion.local(streams["fix"]["time"].to_numpy())[:, 2] < SURFACE_M
+    streams["fix"] = streams["fix"][up]
+    if setting.profiler is None:
+        return Dive(streams, config, motion, hidden), None
+    unit = setting.profiler
+    config["water"] = {"cell_sd_mps": list(unit.sd), "knots": setting.knots}
+    C_bs = mounting((*vehicle.dvl.mount_rpy_deg[:2], hidden.dvl_yaw))
+    table = profiles(motion, vehicle, unit, current, C_bs, rng)
+    for axis in "xyz":
+        table[f"v{axis}"] *= 1.0 + hidden.dvl_scale
+    return Dive(streams, config, motion, hidden), table
+
+
+@dataclass
+class Row:
+    """A row of the table: settings, the first of which is printed, and limits of the end error, or None."""
+
+    setting: Setting
+    live: float | None = None
+    smoothed: float | None = None
+
+
+ROWS = {
+    "300 kHz": Row(Setting(), 12.0, 5.5),
+    "600 kHz": Row(Setting(Profiler(20, 2.0, 2.0, (0.02, 0.02, 0.01))), 10.0, 4.5),
+    "300 kHz, surface for 1 min": Row(Setting(surface_s=60.0)),
+    "one cell": Row(Setting(Profiler(1, 4.0, 4.0), knots=1)),
+    "no layers": Row(Setting(None)),
+}
+
+
+def inspect(folder: Path, dive: Dive) -> dict[str, float]:
+    """Errors of each estimate at the bottom: of the filters just before lock, of the smoother at the end."""
+    found: dict[str, float] = {}
+    depth = dive.motion.local(np.arange(dive.motion.duration))[:, 2]
+    lock = float(np.argmax(depth > depth.max() - LOCK_M)) - 1.0
+    for kind in ("smoothed", "filtered", "online"):
+        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
+        if path.exists():
+            track = pd.read_csv(path)
+            at = track.iloc[-1] if kind == "smoothed" else track.iloc[np.abs(track["time"] - lock).argmin()]
+            off = at[["north", "east"]].to_numpy(float) - dive.motion.local(np.array([at["time"]]))[0, :2]
+            found[f"{kind} end"] = float(np.hypot(*off))
+            found[f"{kind} sd"] = float(np.hypot(at["north_sd"], at["east_sd"]))
+            cov = np.array([[at["north_sd"] ** 2, at["cov_north_east"]], [at["cov_north_east"], at["east_sd"] ** 2]])
+            found[f"{kind} nees"] = float(off @ np.linalg.solve(cov, off)) / 2.0
+    return found
+
+
+def run_row(name: str, seed: int, online: bool) -> Result:
+    """One dive."""
+    dive, table = make_dive(ROWS[name].setting, seed)
+    return run_dive(dive, online, inspect, {} if table is None else {"adcp": table})
+
+
+def figures(name: str, results: Sequence[Result]) -> str:
+    """A row of the table."""
+    row, cells, met = ROWS[name], [], True
+    for kind, limit in (("filtered", row.live), ("smoothed", row.smoothed), ("online", row.live)):
+        done = [r.found for r in results if f"{kind} end" in r.found]
+        if not done:
+            cells.append("–")
+            continue
+        rms, sd = (float(np.sqrt(np.mean([f[f"{kind} {what}"] ** 2 for f in done]))) for what in ("end", "sd"))
+        nees = float(np.mean([f[f"{kind} nees"] for f in done]))
+        met &= limit is None or rms <= limit
+        cells.append(f"{rms:.1f} m (sd {sd:.1f}; NEES {nees:.2f})" + (f", at most {limit:g}" if limit else ""))
+    return "| " + " | ".join([name, *cells, "yes" if met else "**no**", *estimate_cells(results)]) + " |"
+
+
+def cost(rounds: int) -> tuple[float, float]:
+    """Processor time of a descent with and without layers, the least of some rounds [s]."""
+    import tempfile
+
+    import rovgraph
+
+    least = [np.inf, np.inf]
+    with tempfile.TemporaryDirectory() as name:
+        dive, table = make_dive(ROWS["300 kHz"].setting, 0)
+        write_dive(dive, Path(name), {"adcp": table})
+        config = rovgraph.load_config(Path(name) / "vehicle.yaml")
+        log = rovgraph.read_log(Path(name) / "log.csv", config)
+    for _ in range(rounds):
+        for k, use in enumerate((True, False)):
+            begin = time.process_time()
+            rovgraph.smooth(log, config.model_copy(update={"water": config.water.model_copy(update={"use": use})}))
+            least[k] = min(least[k], time.process_time() - begin)
+    return least[0], least[1]
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="+", choices=[*ROWS, "cost"], default=[*ROWS, "cost"], metavar="ROW")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=cores())
+    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
+    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
+    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    arguments = parser.parse_args()
+    rows = [name for name in arguments.rows if name != "cost"]
+    if "cost" in arguments.rows:
+        layers, without = cost(3)
+        print(f"A descent takes {layers:.1f} s with layers, {without:.1f} s without: {layers / without:.2f} times.\n")
+    heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
+    ends = ["filtered at the bottom", "smoothed at the end", "online at the bottom"]
+    heads = ["descent", *ends, "met", *heads, "verdicts"]
+    if rows:
+        print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
+    with workers(arguments.jobs) as pool:
+        for name in rows:
+            with starting():
+                futures = [pool.submit(run_row, name, seed, arguments.online) for seed in range(arguments.seeds)]
+            results = [future.result() for future in futures]
+            print(figures(name, results), flush=True)
+            if arguments.said:
+                print("\n".join(results[0].said), flush=True)
+            if arguments.keep:
+                folder = arguments.keep / name.replace(" ", "_").replace(",", "")
+                folder.mkdir(parents=True, exist_ok=True)
+                dive, table = make_dive(ROWS[name].setting, 0)
+                write_dive(dive, folder, {} if table is None else {"adcp": table})
+
+
+if __name__ == "__main__":
+    main()

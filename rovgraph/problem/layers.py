@@ -1,0 +1,395 @@
+"""From profiles of the water to measurements, and the knots of the current that stand for it.
+
+The current is a function of depth: knots at whole multiples of a spacing h, numbered from the surface downwards,
+linear between them, each a random walk in time, and from knot to knot a first-order Gauss-Markov process,
+
+    u_j = exp(-h / L) u_i + w,  var w = s^2 (1 - exp(-2 h / L)),  i next to j                       (Gelb 1974, 3.8)
+
+A window of K knots about the vehicle is kept, knot j in the place j mod K. As the vehicle descends, the window moves:
+a knot that is left behind makes room for a new one, which is drawn from its neighbour. So the dive stays a chain.
+
+The cells of a profile, y = Phi (v - u), share the vehicle's velocity v; Phi has the weights of the knots u in each
+cell, whose sum is 1. The square-root information of the cells, R with R' R = Phi' W Phi, has two entries in a row, next
+to each other and not negative, as Phi' W Phi is tridiagonal. So R y' = Q' y are at most K measurements, each of the
+velocity relative to a layer between two knots; they hold all that the cells say of v and u.
+"""
+
+import math
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Mapping
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.kernels import assembly
+from rovgraph.kernels import measurement_row as at
+from rovgraph.log import Measurement, Stream
+from rovgraph.model.calibration import LAYERS, LAYOUT, WATER_LAYER
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.problem.problem import Problem
+from rovgraph.sensors.dvl_beam import BeamGeometry, beam_geometry
+from rovgraph.sensors.sensor import LARGEST_SD
+from rovgraph.sensors.water_layer import ADCP, ALONG, ATTITUDE, CELLS, EARTH, VELOCITIES
+
+USUAL_ANGLE_DEG = 30.0  # of beams that nothing is known of; the widest of usual ones
+LEVELLED_S = 0.5  # over which the specific force shows the tilt
+FRESH_S = 5.0  # a depth or altitude is believed so long
+SLOPE_S = 0.5  # of the depth, at least
+REMEMBERED_S = 120.0  # of depth and altitude, online
+SETTLED_S = 1.0  # after the start of a dive from which on profiles count
+TOGETHER_S = 1e-4  # stamps of the cells of one profile
+SAME_M = 1e-6  # depths that differ by rounding
+FILLED = 1e-9  # part of a knot's weight below which no cell is near it
+OUT_OF_SIGHT = 1e3  # sd by which what stood in a knot's place before is forgotten [m/s]
+SIDE_LOBES = "at the bottom or the surface (side lobes)"
+_COLUMN = {name: k for k, name in enumerate(ADCP.column_names)}
+Left = Counter[tuple[str, str]]
+
+
+def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[str], str]:
+    """The sensor that a log's profiles become; and why not, if not so."""
+    if CELLS not in streams or not config.water.use:
+        return [], ""
+    left = "profiles of the water are left out: "
+    cells, columns = streams[CELLS].data, _COLUMN
+    measured = np.isfinite(cells[:, [columns[name] for name in (*VELOCITIES, *ALONG, *EARTH)]])
+    if not measured.any():
+        return [], left + "no velocities, expected adcp_vx, adcp_beam_1 or adcp_north"
+    if not np.isfinite(cells[:, columns["adcp_range"]]).any():
+        return [], left + "cells without ranges; give column range, from the head to the middle of each cell"
+    if "depth" not in streams:
+        return [], left + "the log has no depth"
+    earth = measured[:, len(VELOCITIES) + len(ALONG) :].any()
+    if earth and not np.isfinite(cells[:, [columns[name] for name in ATTITUDE]]).all(axis=1).any():
+        return [], left + "north, east and down without the instrument's heading, roll and pitch, give these columns"
+    if measured[:, len(VELOCITIES) : -len(EARTH)].any() and beam_geometry(config.dvl) is None:
+        return [], left + "it is not known where the beams point; state dvl.beams: {angle_deg, azimuth_deg}"
+    if "place" in streams or config.graph.hydrodynamics:
+        beside = "thrusters" if config.graph.hydrodynamics else "places seen twice"
+        return [], left + f"they are not used beside {beside}; state water.use: false to say so"
+    return [WATER_LAYER], ""
+
+
+def with_knots(config: Config, streams: Mapping[str, Stream]) -> Config:
+    """The configuration with as many knots as the cells of a log reach over, farther apart where these are too few."""
+    if config.water.knots is not None:
+        return config
+    far = streams[CELLS].data[:, _COLUMN["adcp_range"]]
+    reach = float(np.nanmax(far, initial=0.0))
+    spacing = max(config.water.knot_m, reach / (len(LAYERS) - 2))
+    knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS))
+    water = config.water.model_copy(update={"knots": max(knots, 2), "knot_m": spacing})
+    return config.model_copy(update={"water": water})
+
+
+class Cells(NamedTuple):
+    """n cells of one profile.
+
+    Attributes
+    ----------
+    down : shape (n,), depth of each below the head [m]
+    velocity : shape (n, 3), of the DVL relative to the water, its own axes [m/s]
+    sd : shape (n,), of the horizontal components; NaN = not known [m/s]
+    """
+
+    down: Array
+    velocity: Array
+    sd: Array
+
+
+class WaterLayers:
+    """Makes measurements of layers of profiles.
+
+    Parameters
+    ----------
+    config : effective configuration
+    used : whether profiles are used
+    """
+
+    def __init__(self, config: Config, used: bool) -> None:
+        self.config, self.used = config, used
+        self.waiting: list[Measurement] = []  # cells of a profile of which more may come
+        self._signals: dict[str, tuple[list[float], list[float]]] = {"depth": ([], []), "dvl_altitude": ([], [])}
+        self._geometry = beam_geometry(config.dvl)
+        self._R_bs = mount_matrix(config.dvl.mount_rpy_deg)
+        angle = config.water.beam_angle_deg or config.dvl.beams.angle_deg or USUAL_ANGLE_DEG
+        self._cosine = abs(math.cos(math.radians(angle)))
+        down = self._R_bs[2, 2] >= 0.0
+        self._axis = np.array([0.0, 0.0, 1.0 if down == (config.water.looks == "down") else -1.0])
+        self._arm_b = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
+        self._below_sensor = np.array(config.dvl.lever_arm_m) - np.array(config.depth.lever_arm_m)
+        knots = config.water.knots or len(LAYERS)
+        names = LAYERS[:knots] if knots > 1 else ("current",)
+        self._places = np.array([LAYOUT[name].start for name in names])
+
+    # what the vehicle's depth is, and how far it is to the bottom
+
+    def take_one(self, m: Measurement) -> None:
+        """Take a depth or an altitude, online."""
+        times, values = self._signals[m.sensor]
+        k = bisect_right(times, m.time)
+        times.insert(k, m.time)
+        values.insert(k, float(m.values[0]))
+        gone = bisect_right(times, m.time - REMEMBERED_S)
+        del times[:gone], values[:gone]
+
+    def copy(self) -> "WaterLayers":
+        """One that goes on by itself from here."""
+        twin = copy(self)
+        twin.waiting = self.waiting[:]
+        twin._signals = {sensor: (time[:], values[:]) for sensor, (time, values) in self._signals.items()}
+        return twin
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Streams that `take_one` needs."""
+        return tuple(self._signals) if self.used else ()
+
+    def _depth(self, time: float) -> float:
+        """By the samples up to a time alone, so that a dive online gets the same; NaN where there is none [m]."""
+        times, values = self._signals["depth"]
+        k = bisect_right(times, time) - 1
+        if k < 0 or time - times[k] > FRESH_S:
+            return math.nan
+        j = bisect_right(times, times[k] - SLOPE_S) - 1
+        if j < 0 or times[k] - times[j] > FRESH_S:
+            return values[k]
+        return values[k] + (values[k] - values[j]) * (time - times[k]) / (times[k] - times[j])
+
+    def _altitude(self, time: float) -> float:
+        times, values = self._signals["dvl_altitude"]
+        k = bisect_right(times, time) - 1
+        return values[k] if k >= 0 and time - times[k] <= FRESH_S and values[k] > 0.0 else math.inf
+
+    # from cells to layers
+
+    def of_log(self, streams: Mapping[str, Stream], imu: Array, left_out: Left) -> list[Stream]:
+        """Measurements of a whole log, as `of` has them."""
+        if not self.used or CELLS not in streams:
+            return []
+        for sensor in self._signals:
+            if sensor in streams:
+                self._signals[sensor] = streams[sensor].time.tolist(), streams[sensor].data[:, 0].tolist()
+        return [self.of(streams[CELLS], imu, None, left_out)]
+
+    def of(self, cells: Stream, imu: Array, first: int | None, left_out: Left) -> Stream:
+        """Measurements of layers: components, their sd, context and number of the layer, shape (k, 7 + LAYER_WIDTH).
+
+        Parameters
+        ----------
+        cells : of the stream "adcp", in the order of time
+        imu : ndarray, shape (m, 7), samples in body axes; of shape (0, 7) the vehicle is taken as level
+        first : the uppermost knot of those that are kept, before; None = none is
+        left_out : counts cells that are left out
+        """
+        begins = np.flatnonzero(np.diff(cells.time, prepend=-np.inf) > TOGETHER_S)
+        time, rows, lines = [], [np.empty((0, 7 + at.LAYER_WIDTH))], []
+        for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), len(cells)], strict=True):
+            t = float(cells.time[begin])
+            if len(imu) and t < imu[0, 0] + SETTLED_S:
+                left_out[CELLS, "before the dive or in its first second"] += end - begin
+                continue
+            made, first = self._profile(t, cells.data[begin:end], imu, first, left_out)
+            rows.append(made)
+            time += [t] * len(made)
+            lines += [int(cells.row[begin])] * len(made)
+        return Stream(WATER_LAYER, (), np.array(time), np.concatenate(rows), np.array(lines, np.int64))
+
+    def _profile(
+        self, time: float, data: Array, imu: Array, first: int | None, left_out: Left
+    ) -> tuple[Array, int | None]:
+        """Measurements of one profile, and the uppermost knot."""
+        empty, depth = np.empty((0, 7 + at.LAYER_WIDTH)), self._depth(time)
+        if math.isnan(depth):
+            left_out[CELLS, f"without a depth within {FRESH_S:g} s"] += len(data)
+            return empty, first
+        down_b = _level(imu, time)
+        bottom = np.nanmin(data[:, _COLUMN["adcp_bottom"]], initial=self._altitude(time))
+        limit = depth if self.config.water.looks == "up" else bottom
+        data = self._admitted(data, limit * self._cosine, left_out)
+        cells = self._cells(data, down_b)
+        if not len(cells.down):
+            return empty, first
+        head, spacing, K = depth + float(self._below_sensor @ down_b), self.config.water.knot_m, len(self._places)
+        place = (head + cells.down) / spacing
+        if K == 1:
+            return self._rows(np.zeros(len(place)), cells, -1), first
+        low, high = math.floor(place.min()), math.floor(place.max()) + 1
+        first = low if first is None else min(max(first, high - K + 1), low)
+        within = place < first + K - 1
+        left_out[CELLS, "beyond the knots of the current"] += int((~within).sum())
+        return self._rows(place[within], Cells(*(a[within] for a in cells)), first), first
+
+    def _admitted(self, data: Array, far: float, left_out: Left) -> Array:
+        """Cells that may be used; their far end is nearer than ``far`` [m]."""
+        ends = data[:, _COLUMN["adcp_range"]] + 0.5 * np.nan_to_num(data[:, _COLUMN["adcp_cell"]])
+        v = data[:, [_COLUMN[name] for name in (*VELOCITIES, *ALONG, *EARTH)]]
+        speed = np.nanmax(np.abs(v), axis=1, initial=0.0)
+        good = np.ones(len(data), bool)
+        for why, bad in (
+            ("without a range", ~(ends > 0.0)),
+            ("not valid", (data[:, _COLUMN["adcp_valid"]] == 0.0) | ~np.isfinite(v).any(axis=1)),
+            (SIDE_LOBES, ends > far),
+            ("faster than dvl.max_speed_mps", speed > self.config.dvl.max_speed_mps),
+        ):
+            if count := int((bad & good).sum()):
+                left_out[CELLS, why] += count
+            good &= ~bad
+        return data[good]
+
+    def _cells(self, data: Array, down_b: Array) -> Cells:
+        """Cells by whichever axes they are in."""
+        far = data[:, _COLUMN["adcp_range"]]
+        down = far * float((self._R_bs @ self._axis) @ down_b)
+        v = data[:, [_COLUMN[name] for name in VELOCITIES]].copy()
+        earth = data[:, [_COLUMN[name] for name in EARTH]]
+        rpy = data[:, [_COLUMN[name] for name in ATTITUDE]]
+        turned = np.isnan(v).any(axis=1) & np.isfinite(earth).all(axis=1) & np.isfinite(rpy).all(axis=1)
+        if turned.any():
+            v[turned] = (earth[turned, None] @ matrix_from_rpy(rpy[turned]))[:, 0]
+        along = data[:, [_COLUMN[name] for name in ALONG]]
+        if self._geometry is not None and np.isnan(v).all() and np.isfinite(along).any():
+            v = by_mapped_beams(along, far, down, self._geometry, self._R_bs.T @ down_b)
+        good = np.isfinite(v).all(axis=1)
+        return Cells(down[good], v[good], data[good, _COLUMN["adcp_sd"]])
+
+    def _rows(self, place: Array, cells: Cells, first: int) -> Array:
+        """At most one measurement between two knots; ``place`` is the depth of each cell in knots."""
+        believed, rho = np.array(self.config.water.cell_sd_mps), self.config.water.cell_correlation
+        relative = np.where(np.isfinite(cells.sd), np.minimum(cells.sd, LARGEST_SD), believed[0]) / believed[0]
+        K = len(self._places)
+        above = np.floor(place).astype(np.int64) - first if K > 1 else np.zeros(len(place), np.int64)
+        share, weight = place - np.floor(place), 1.0 / np.square(relative)
+        here, below, right = np.zeros(K), np.zeros(K), np.zeros((K + 1, 3))
+        np.add.at(here, above, weight * (1.0 - share) ** 2)
+        np.add.at(below, above, weight * share * (1.0 - share))
+        np.add.at(right, above, (weight * (1.0 - share))[:, None] * cells.velocity)
+        if K > 1:
+            np.add.at(here, above + 1, weight * share**2)
+            np.add.at(right, above + 1, (weight * share)[:, None] * cells.velocity)
+        out, before, q, least = [], 0.0, np.zeros(3), FILLED * float(here.max(initial=0.0))
+        widened = believed * math.sqrt(1.0 + 2.0 * rho * (len(place) > 1))
+        for k in range(K):
+            pivot = here[k] - before**2
+            if pivot <= least:
+                before, q = 0.0, np.zeros(3)
+                continue
+            root = math.sqrt(pivot)
+            q = (right[k] - before * q) / root
+            before = below[k] / root
+            total, knot = root + before, first + k
+            context = np.zeros(at.LAYER_WIDTH)
+            context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
+            context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
+            context[[at.SHARE, at.FIRST_KNOT]] = before / total, first
+            out.append(np.concatenate([q / total, widened / total, context, [float(k)]]))
+        return np.array(out).reshape(-1, 7 + at.LAYER_WIDTH)
+
+
+def _level(imu: Array, time: float) -> Array:
+    """Direction down in b, shape (3,), by the mean specific force of the samples before a time."""
+    first, last = np.searchsorted(imu[:, 0], [time - LEVELLED_S, time], side="right") if len(imu) else (0, 0)
+    if last <= first:
+        return np.array([0.0, 0.0, 1.0])
+    force = imu[first:last, 1:4].mean(axis=0)
+    return np.asarray(-force / np.linalg.norm(force))
+
+
+def by_mapped_beams(along: Array, far: Array, down: Array, head: BeamGeometry, down_s: Array) -> Array:
+    """Velocities of cells of one profile, DVL axes, from those along beams, each taken at the depth of the cell.
+
+    On a tilted head the cells of one number are at different depths, by beam.
+
+    Parameters
+    ----------
+    along : ndarray, shape (n, 9), by the instrument's numbers [m/s]
+    far, down : ndarray, shape (n,), along the head's axis, and depth below the head [m]
+    head : where the beams point
+    down_s : ndarray, shape (3,), direction down in the DVL's axes
+    """
+    mapped = np.full((len(along), len(head.numbers)), np.nan)
+    order = np.argsort(down)
+    step = np.median(np.abs(np.diff(np.sort(down)))) if len(down) > 1 else 1.0
+    for k, number in enumerate(head.numbers):
+        direction = head.directions[k]
+        there, b = far / abs(direction[2]) * float(direction @ down_s), along[:, number]
+        known = order[np.isfinite(b[order])]
+        known = known[np.argsort(there[known])]
+        if not len(known):
+            continue
+        near = np.abs(there[known][:, None] - down[None]).min(axis=0) <= step
+        near &= (down >= there[known[0]] - SAME_M) & (down <= there[known[-1]] + SAME_M)
+        mapped[:, k] = np.where(near, np.interp(down, there[known], b[known]), np.nan)
+    out = np.full((len(along), 3), np.nan)
+    valid = np.isfinite(mapped)
+    for pattern in np.unique(valid, axis=0):
+        D, rows = head.directions[pattern], (valid == pattern).all(axis=1)
+        if pattern.sum() >= 3 and np.linalg.svd(D, compute_uv=False)[-1] > 0.05:
+            out[rows] = mapped[np.ix_(rows, pattern)] @ np.linalg.pinv(D).T
+    return out
+
+
+# the window of knots
+
+
+class NewKnot(NamedTuple):
+    """A knot that takes another's place: the variables of both, and of its neighbour, None where it has none."""
+
+    name: str
+    neighbour: str | None
+
+
+def put_windows(keyframes: Array, rows: Array, of: NDArray[np.int64], layer: int, begin: int, context: int) -> None:
+    """Write the uppermost knot to each keyframe from one on, as the measurements at it say.
+
+    Measurements beside a keyframe, where no window can change, say nothing if they need one.
+
+    Parameters
+    ----------
+    keyframes, rows, of : as of `rovgraph.problem.problem.Problem`; rows of ``keyframes`` are written
+    layer : number of the sensor, -1 = not used
+    begin : the first keyframe
+    context : numbers at the end of each row
+    """
+    keyframes[begin:, assembly.FIRST_KNOT] = keyframes[begin - 1, assembly.FIRST_KNOT] if begin else np.nan
+    taken = int(keyframes[begin - 1, assembly.TAKEN]) if begin else 0
+    some = taken + np.flatnonzero(of[assembly.WHICH, taken:] == layer)
+    first = rows[some, rows.shape[1] - context + at.FIRST_KNOT]
+    keyframe = of[assembly.KEYFRAME_OF, some]
+    here = keyframe == of[assembly.INTERVAL_OF, some]
+    here &= keyframe > 0
+    for k, knot in zip(keyframe[here].tolist(), first[here].tolist(), strict=True):
+        keyframes[k:, assembly.FIRST_KNOT] = knot
+    apart = some[keyframes[keyframe, assembly.FIRST_KNOT] != first]
+    rows[apart, at.SD : at.SD + 3] = LARGEST_SD
+
+
+def window_changes(problem: Problem) -> NDArray[np.int64]:
+    """Keyframes, beyond the first, from the one before to which the window moves."""
+    first = problem.keyframes[:, assembly.FIRST_KNOT]
+    return np.flatnonzero((first[1:] != first[:-1]) & np.isfinite(first[1:])) + 1
+
+
+def new_knots(problem: Problem, k: int, count: int) -> list[NewKnot]:
+    """Knots that are new at keyframe k, each after its neighbour, of ``count`` that are kept."""
+    before, now = problem.keyframes[k - 1 : k + 1, assembly.FIRST_KNOT].tolist()
+    if count < 2 or now == before or math.isnan(now):
+        return []
+    first = int(now)
+    if not abs(now - before) < count:  # never where that is nan
+        chain = [(first, None), *((j, j - 1) for j in range(first + 1, first + count))]
+    elif now > before:
+        chain = [(j, j - 1) for j in range(int(before) + count, first + count)]
+    else:
+        chain = [(j, j + 1) for j in range(int(before) - 1, first - 1, -1)]
+    return [NewKnot(LAYERS[j % count], None if i is None else LAYERS[i % count]) for j, i in chain]
+
+
+def conditional(config: Config) -> tuple[float, float]:
+    """What a knot keeps of its neighbour, and the sd that is added [m/s]."""
+    kept = math.exp(-config.water.knot_m / config.water.correlation_m)
+    return kept, config.water.current_sd_mps * math.sqrt(1.0 - kept**2)

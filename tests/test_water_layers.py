@@ -1,0 +1,237 @@
+"""Profiles of the water: what becomes of their cells, and that chain, filter and live dives know the current alike."""
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.inference.error_state import replay
+from rovgraph.inference.initialise import initialise
+from rovgraph.inference.smoother import assemble
+from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.assembly import FIRST_KNOT
+from rovgraph.log import Log, Stream
+from rovgraph.log.adcp import usable_cells
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
+from rovgraph.model.config import Config, parse_config
+from rovgraph.model.state import State
+from rovgraph.problem.assembly import assembly_of
+from rovgraph.problem.layers import WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.sensors.dvl import DvlVelocity
+from rovgraph.sensors.dvl_beam import beam_geometry
+from rovgraph.sensors.water_layer import ADCP, CELLS, WaterLayer
+
+NAMES = ADCP.column_names
+JANUS = {"angle_deg": 20.0, "azimuth_deg": [270.0, 90.0, 0.0, 180.0]}
+
+
+def cells(time: Array | float, **columns: Array) -> Stream:
+    """Cells with some of their columns, named without prefix."""
+    n = max(np.size(values) for values in columns.values())
+    data = np.full((n, len(NAMES)), np.nan)
+    for name, values in columns.items():
+        data[:, NAMES.index(f"adcp_{name}")] = values
+    return Stream(CELLS, NAMES, np.broadcast_to(time, n).astype(float), data, np.arange(n) + 2)
+
+
+def layers(config: str, depth: float = 20.0, altitude: float | None = None) -> WaterLayers:
+    made = WaterLayers(parse_config(config), True)
+    made._signals["depth"] = [9.9], [depth]
+    if altitude is not None:
+        made._signals["dvl_altitude"] = [9.9], [altitude]
+    return made
+
+
+LEVEL = np.empty((0, 7))
+
+
+def context(rows: Stream) -> Array:
+    return rows.data[:, 6 : 6 + at.LAYER_WIDTH]
+
+
+def test_rows_of_a_profile_hold_all_that_its_cells_say():
+    """Least squares by the rows and by the cells themselves give the same velocities and covariance."""
+    rng = np.random.default_rng(1)
+    far, v = np.arange(3.0, 43.0, 4.0), rng.normal(0.0, 0.3, (10, 3))
+    sd = rng.uniform(0.03, 0.1, 10)
+    made = layers("water: {knots: 8, cell_correlation: 0}")
+    rows = made.of(cells(10.0, range=far, vx=v[:, 0], vy=v[:, 1], vz=v[:, 2], sd=sd), LEVEL, None, Counter())
+    place = (20.0 + far) / 10.0
+    Phi = np.maximum(1.0 - np.abs(place[:, None] - np.arange(2, 7)), 0.0)
+    W = 1.0 / sd**2
+    share, places = context(rows)[:, at.SHARE], context(rows)[:, [at.ABOVE_AT, at.BELOW_AT]]
+    knot = {p: j for j, p in enumerate(made._places[np.arange(2, 7) % 8].tolist())}
+    A = np.zeros((len(rows), 5))
+    for k, (above, below) in enumerate(places.tolist()):
+        A[k, knot[above]] += 1.0 - share[k]
+        A[k, knot[below]] += share[k]
+    by_rows = 1.0 / rows.data[:, 3] ** 2
+    np.testing.assert_allclose(A.T * by_rows @ A, Phi.T * W @ Phi, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(A.T * by_rows @ rows.data[:, :3], Phi.T * W @ v, rtol=1e-9, atol=1e-9)
+    assert len(rows) == 5 and (share >= 0.0).all() and (share <= 1.0).all()
+
+
+def test_neighbouring_cells_widen_each_others_noise():
+    velocity = {"vx": np.zeros(4), "vy": np.zeros(4), "vz": np.zeros(4)}
+    found = [
+        layers(f"water: {{knots: 1, cell_correlation: {rho}}}").of(
+            cells(10.0, range=np.arange(2.0, 6.0), **velocity), LEVEL, None, Counter()
+        )
+        for rho in (0.0, 0.15)
+    ]
+    assert found[0].data[0, 3] == pytest.approx(0.025)
+    assert found[1].data[0, 3] == pytest.approx(0.025 * np.sqrt(1.3))
+
+
+@pytest.mark.parametrize(
+    ("bottom", "kept"), [(np.nan, 10), (30.0 / np.cos(np.pi / 6) + 0.01, 10), (30.0 / np.cos(np.pi / 6) - 0.01, 9)]
+)
+def test_cells_beyond_the_side_lobes_are_left_out(bottom, kept):
+    far, zero = np.arange(2.0, 30.0, 3.0), np.zeros(10)
+    made = layers("water: {knots: 8}")
+    left = Counter()
+    made.of(cells(10.0, range=far, cell=2.0, bottom=bottom, vx=zero, vy=zero, vz=zero), LEVEL, None, left)
+    assert 10 - sum(left.values()) == kept
+
+
+def test_a_bottom_that_the_table_does_not_mark_is_known_by_the_altitude():
+    far, zero, left = np.arange(2.0, 30.0, 3.0), np.zeros(10), Counter()
+    layers("water: {knots: 8}", altitude=15.0).of(cells(10.0, range=far, vx=zero, vy=zero, vz=zero), LEVEL, None, left)
+    assert sum(left.values()) == np.count_nonzero(far > 15.0 * np.cos(np.pi / 6))
+
+
+def test_beams_of_a_tilted_head_are_taken_at_the_depth_of_the_cell():
+    head = beam_geometry(parse_config("dvl: {beams: " + str(JANUS).replace("'", "") + "}").dvl)
+    R_ns = matrix_from_rpy([0.2, -0.1, 0.7])
+    far, along = np.arange(4.0, 44.0, 2.0), np.full((20, 9), np.nan)
+    v_n = np.array([0.3, -0.2, 0.4])
+
+    def relative(down: Array) -> Array:
+        return v_n - np.column_stack([0.01 * down, -0.004 * down, 0.0 * down])  # the current grows with depth
+
+    for k, number in enumerate(head.numbers):
+        there = far / head.directions[k, 2] * (R_ns @ head.directions[k])[2]
+        along[:, number] = relative(there) @ R_ns @ head.directions[k]
+    down = far * R_ns[2, 2]
+    found = by_mapped_beams(along, far, down, head, R_ns[2])
+    inside = np.isfinite(found).all(axis=1)
+    assert inside.sum() >= 14
+    np.testing.assert_allclose(found[inside], (relative(down) @ R_ns)[inside], atol=1e-9)
+
+
+def test_cells_in_earth_axes_are_turned_back_by_the_instruments_own_attitude():
+    rpy, v_n = np.array([0.1, -0.05, 2.0]), np.array([[0.3, 0.1, 0.2]])
+    by = {"north": v_n[:, 0], "east": v_n[:, 1], "down": v_n[:, 2], "roll": rpy[0], "pitch": rpy[1], "heading": rpy[2]}
+    rows = layers("water: {knots: 1}").of(cells(10.0, range=np.array([5.0]), **by), LEVEL, None, Counter())
+    np.testing.assert_allclose(rows.data[0, :3], v_n[0] @ matrix_from_rpy(rpy), atol=1e-12)
+
+
+def test_the_window_follows_the_vehicle_and_stays_where_it_can():
+    made, zero, first = layers("water: {knots: 5}"), np.zeros(9), []
+    for depth in (21.0, 29.0, 19.5, 47.0, 500.0, 30.0):
+        made._signals["depth"] = [9.9], [depth]
+        far = np.arange(1.0, 28.0, 3.0)
+        rows = made.of(
+            cells(10.0, range=far, vx=zero, vy=zero, vz=zero), LEVEL, int(first[-1]) if first else None, Counter()
+        )
+        first.append(float(context(rows)[0, at.FIRST_KNOT]))
+    assert first == [2.0, 2.0, 2.0, 4.0, 49.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"range": np.ones(2)}, "no velocities"),
+        ({"vx": np.ones(2), "vy": np.ones(2), "vz": np.ones(2)}, "without ranges"),
+        ({"range": np.ones(2), "north": np.ones(2), "east": np.ones(2), "down": np.ones(2)}, "heading, roll and pitch"),
+        ({"range": np.ones(2), "beam_1": np.ones(2)}, "where the beams point"),
+    ],
+)
+def test_cells_that_cannot_be_used_are_named_in_one_line(columns, said):
+    streams = {
+        CELLS: cells(1.0, **columns),
+        "depth": Stream("depth", ("depth",), np.ones(1), np.ones((1, 1)), np.ones(1)),
+    }
+    used, why = layer_sensors(parse_config(""), streams)
+    assert not used and said in why and "\n" not in why
+    assert "no depth" in layer_sensors(parse_config(""), {CELLS: cells(1.0, range=np.ones(1), vx=np.ones(1))})[1]
+
+
+def test_a_table_without_ranges_and_one_of_another_clock_are_left_out_with_a_warning():
+    with pytest.warns(match="cells without ranges"):
+        assert usable_cells({"time": np.ones(3), "vx": np.ones(3)}, parse_config(""), "adcp") is None
+    table = {"time": np.repeat([1e5, 1e5 + 1], 2), "range": np.tile([2.0, 4.0], 2), "vx": np.arange(4.0)}
+    stream = usable_cells(table, parse_config(""), "adcp")
+    log = Log.from_arrays(time=np.arange(0.0, 3.0, 0.1), depth=np.arange(30.0))
+    with pytest.warns(match="profiles of the water have times"):
+        assert CELLS not in log.with_profiles(stream)
+
+
+def test_range_and_heading_of_the_table_are_not_those_of_other_sensors():
+    table = {"time": [1.0, 1.0], "range": [2.0, 4.0], "heading": [0.1, 0.1], "vx": [0.1, 0.2]}
+    stream = usable_cells(table, parse_config(""), "adcp")
+    np.testing.assert_allclose(stream["adcp_range"], [2.0, 4.0])
+    np.testing.assert_allclose(stream["adcp_heading"], 0.1)
+
+
+@pytest.fixture(scope="module")
+def descent() -> tuple[Log, Config]:
+    """A short descent through three windows, without bottom lock in the middle, and profiles of a sheared current."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    import water
+    from fault_campaign.instruments import log_table
+    from fault_campaign.water import Profiler
+
+    setting = water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0, knots=4)
+    dive, table = water.make_dive(setting, 1)
+    config = Config.model_validate(dive.configuration)
+    log = Log.from_frame(log_table(dive.streams), config)
+    return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
+
+
+@pytest.mark.slow
+def test_chain_and_filter_agree_through_moving_windows(descent):
+    """Going back over the filter's steps gives the smoother, through knots that others take the place of."""
+    log, config = descent
+    initial = initialise(log, config)
+    smoother = assemble(log, initial)
+    problem = smoother.problem
+    moved = window_changes(problem)
+    assert len(moved) > 5 and all(new_knots(problem, k, 4) for k in moved.tolist())
+    back, chain = replay(problem, initial).smoothed().trajectory, smoother.solve().trajectory
+    sd = chain.to_frame()[["north_sd", "east_sd"]].to_numpy()
+    late = slice(len(problem) // 4, None)
+    assert (np.abs(back.p_n - chain.p_n)[late, :2] < 0.5 * sd[late]).all()
+    np.testing.assert_allclose(back.to_frame()["north_sd"].to_numpy()[late], sd[late, 0], rtol=0.2)
+
+
+@pytest.mark.slow
+def test_a_dive_measurement_by_measurement_has_the_rows_of_the_whole_log(descent):
+    log, config = descent
+    initial = initialise(log, config)
+    whole, live = assemble(log, initial).problem, assembly_of(initial)
+    for m in log.measurements():
+        live.insert(m)
+        live.extend()
+    live.extend(finish=True)
+    one = live.problem
+    np.testing.assert_array_equal(one.keyframes[:, FIRST_KNOT], whole.keyframes[:, FIRST_KNOT])
+    rows = (problem.rows[problem.of_sensor(WATER_LAYER)] for problem in (one, whole))
+    np.testing.assert_allclose(*rows, atol=1e-12)
+
+
+def test_with_one_knot_a_layer_has_the_equation_of_water_track():
+    rng, at_current = np.random.default_rng(3), np.zeros((1, at.LAYER_WIDTH))
+    at_current[0, [at.ABOVE_AT, at.BELOW_AT]] = LAYOUT["current"].start
+    calibration = {name: 0.1 * rng.standard_normal(v.dim) for name, v in TABLE.items()}
+    state = State(matrix_from_rpy([[0.1, -0.2, 1.0]]), *rng.standard_normal((2, 1, 3)), np.zeros((1, 6)), calibration)
+    rate = rng.standard_normal((1, 3))
+    layer = WaterLayer(at_current, knots=1).predict(state, rate)
+    track = DvlVelocity(np.zeros(3), "dvl_water").predict(state, rate)
+    np.testing.assert_array_equal(layer[0], track[0])
+    assert layer[1].keys() == track[1].keys()
+    for name, by in track[1].items():
+        np.testing.assert_array_equal(layer[1][name], by)
