@@ -208,10 +208,10 @@ def survey(case: Case, seed: int) -> Outcome:
     seconds = time.perf_counter() - begin
     left = e if not found.ties else e - (after := Drift(knots, np.zeros(len(P)), P).tied(found.ties)).mean
     nees = 0.0
-    off = np.array(
-        [e[2 * a : 2 * a + 2] - e[2 * b : 2 * b + 2] - tie.shift for tie in found.ties for a, b in [tie.knots]]
-    )
-    wrong = int((np.linalg.norm(off, axis=1) > 3.0).sum()) if len(off) else 0
+    pairs = np.array([tie.knots for tie in found.ties], int).reshape(-1, 2)
+    shifts, rest = (x.reshape(-1, 2)[pairs[:, 0]] - x.reshape(-1, 2)[pairs[:, 1]] for x in (e, left))
+    off = shifts - np.array([tie.shift for tie in found.ties]).reshape(-1, 2)
+    wrong = int((np.linalg.norm(rest, axis=1) > 3.0).sum())
     nees_ties = np.nan
     if found.ties:
         each = [after.P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(1, len(knots))]

@@ -15,6 +15,7 @@ from rovgraph.diagnosis.statistics import find_advice, find_alarms, statistics
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.geometry import Array
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
+from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import Rival
 from rovgraph.inference.crossovers import with_crossovers
@@ -264,8 +265,11 @@ class _Solver:
             return "crossovers: nothing is used: they need a smoothed track of a dive without places or iSAM2"
         if self.rivals or self.mirrors:
             return "crossovers: nothing is used: another explanation of the dive is as likely"
-        self.estimates[0], found = with_crossovers(first, self.log, self.initial.config)
-        return found.text if found else "crossovers: nothing is used: the log has no ranges to the bottom"
+        bottom = bottom_of(self.log, self.initial.config, first)
+        if bottom is None:
+            return "crossovers: nothing is used: the log has no ranges to the bottom"
+        self.estimates[0], found = with_crossovers(first, bottom)
+        return found.text
 
     def dive(self, more: Mapping[str, object]) -> DiveEstimates:
         """As it is believed to be, with more in the summary of its main estimate."""

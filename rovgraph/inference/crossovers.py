@@ -10,8 +10,8 @@ the track's errors, north and east, when it was where they cross. Its likelihood
 
     L(d) = log p(z_A | z_B, d) - log p(z_A | z_B, no common relief)
 
-in which heights and slopes of both lines about the crossing are their own: tide, depth sensor and trim. One field has many
-peaks, a third to a half of the highest are wrong. So a line is matched as a whole with all earlier ones: shifts of all
+in which heights and slopes of both lines about the crossing are their own: tide, depth sensor and trim. One field has
+many peaks, a third to a half of the highest are wrong. So a line is matched as a whole with all earlier ones: shifts of all
 its crossings are correlated by the joint covariance of the track, and the search keeps the `KEPT` best combinations
 of peaks. Used is what all combinations within `LEAD` of the best have in common, at three crossings or more. What a
 field says of its crossing's shift, beside what the track and the other crossings say of it, is found by expectation
@@ -24,15 +24,16 @@ Rotation and scale of the whole track leave no shift where it crosses itself: cr
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.inference.bottom import bottom_of
-from rovgraph.inference.estimate import Estimate
-from rovgraph.log import Log
-from rovgraph.model.config import Config
+
+if TYPE_CHECKING:
+    from rovgraph.inference.bottom import Bottom
+    from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
@@ -326,8 +327,8 @@ class Crossovers:
         return f"crossovers: nothing is used: {why}"
 
 
-def with_crossovers(estimate: Estimate, log: Log, config: Config) -> tuple[Estimate, Crossovers | None]:
-    """A smoothed track corrected where its soundings show its drift, and what they showed; None without ranges.
+def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, Crossovers]":
+    """A smoothed track corrected where its soundings show its drift, and what they showed.
 
     The correction and what it leaves of the covariance are exact at the knots of the drift, and interpolated between
     them. Velocities follow; attitude, calibration and their sds stay as they are.
@@ -335,11 +336,10 @@ def with_crossovers(estimate: Estimate, log: Log, config: Config) -> tuple[Estim
     Parameters
     ----------
     estimate : smoothed, with its joint covariance
-    log, config : of the dive
+    bottom : under it
     """
-    track, posterior, bottom = estimate.trajectory, estimate.posterior, bottom_of(log, config, estimate)
-    if bottom is None or posterior is None:
-        return estimate, None
+    track, posterior = estimate.trajectory, estimate.posterior
+    assert posterior is not None
     apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
     times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
     keyframes = np.unique(np.searchsorted(track.time, times).clip(max=len(track) - 1))
@@ -569,7 +569,7 @@ class _Search:
         values = [_robust(field) for field, _ in found]
         count, sites = len(clear), [np.eye(2) / SAME_M**2] * len(clear)
         pulls = [site @ shifts[k] for site, k in zip(sites, clear, strict=True)]
-        shown, misfit, gain = np.zeros(count), np.zeros(count), 0.0
+        shown, misfit = np.zeros(count), np.zeros(count)
         for _ in range(6):
             for j in range(count):
                 part = slice(2 * j, 2 * j + 2)

@@ -481,7 +481,7 @@ class Graph(ConfigSection):
         True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
     )
     crossovers: bool = Field(
-        False, description="correct the smoothed track where its soundings of earlier lines and of later ones must agree"
+        False, description="correct the smoothed track where soundings of lines that cross or run again must agree"
     )
 
     @property
