@@ -246,7 +246,8 @@ def main() -> None:
             f"| {name} | {before:.1f} | {after:.1f} | {after / before:.2f} | {len(some)} of {len(out)} | "
             f"{sum(o.ties for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
             f"{np.mean([o.nees for o in some]) if some else np.nan:.2f} | "
-            f"{np.nanmean([o.nees_ties for o in some]) if some else np.nan:.2f} | {np.mean([o.seconds for o in out]):.1f} |",
+            f"{np.nanmean([o.nees_ties for o in some]) if some else np.nan:.2f} | "
+            f"{np.mean([o.seconds for o in out]):.1f} |",
             flush=True,
         )
 
