@@ -11,12 +11,12 @@ the track's errors, north and east, when it was where they cross. Its likelihood
     L(d) = log p(z_A | z_B, d) - log p(z_A | z_B, no common relief)
 
 in which heights and slopes of both lines about the crossing are their own: tide, depth sensor and trim. One field has
-many peaks, a third to a half of the highest are wrong. So a line is matched as a whole with all earlier ones: shifts of all
-its crossings are correlated by the joint covariance of the track, and the search keeps the `KEPT` best
-combinations of peaks. Used is what all combinations within `LEAD` of the best have in common, at three crossings or more. What a
-field says of its crossing's shift, beside what the track and the other crossings say of it, is found by expectation
-propagation (Minka 2001): its moments about the match, not the curvature at its peak, are the noise of a tie between two
-keyframes.
+many peaks, a third to a half of the highest are wrong. So a line is matched as a whole with all earlier ones: shifts
+of all its crossings are correlated by the joint covariance of the track, and the search keeps the `KEPT` best
+combinations of peaks. Used is what all combinations within `LEAD` of the best have in common, at three crossings or
+more. What a field says of its crossing's shift, beside what the track and the other crossings say of it, is found by
+expectation propagation (Minka 2001): its moments about the match, not the curvature at its peak, are the noise of a
+tie between two keyframes.
 
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
