@@ -15,8 +15,10 @@ from rovgraph.diagnosis.statistics import find_advice, find_alarms, statistics
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.geometry import Array
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
+from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import Rival
+from rovgraph.inference.crossovers import with_crossovers
 from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.initialise import initialise
@@ -252,7 +254,22 @@ class _Solver:
         if self.found:
             more["noise_found"] = [one.as_dict() for one in self.found]
         assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
+        if self.initial.config.graph.crossovers:
+            assumptions.insert(0, self._cross())
         return replace(self.dive(more), initial=replace(self.initial, assumptions=assumptions))
+
+    def _cross(self) -> str:
+        """Correct the smoothed estimate by its crossovers; one line on what was used."""
+        first = self.estimates[0]
+        if first.kind != "smoothed" or first.posterior is None:
+            return "crossovers: nothing is used: they need a smoothed track of a dive without places or iSAM2"
+        if self.rivals or self.mirrors:
+            return "crossovers: nothing is used: another explanation of the dive is as likely"
+        bottom = bottom_of(self.log, self.initial.config, first)
+        if bottom is None:
+            return "crossovers: nothing is used: the log has no ranges to the bottom"
+        self.estimates[0], found = with_crossovers(first, bottom)
+        return found.text
 
     def dive(self, more: Mapping[str, object]) -> DiveEstimates:
         """As it is believed to be, with more in the summary of its main estimate."""

@@ -212,6 +212,24 @@ class Posterior:
         rows = (which.reshape(-1)[:, None] * MOTION + np.arange(MOTION)).ravel()
         return P[np.ix_(rows, rows)], R_nb[which.reshape(-1)]
 
+    def horizontal(self, keyframes: Sequence[int]) -> Array:
+        """Joint covariance of north and east of m keyframes, increasing, shape (2 m, 2 m) [m^2]."""
+        known, R_nb = self._marginals(), self.optimum.state.R_nb
+        H, X, gains = known._at(keyframes)
+        m, rows = len(keyframes), R_nb[np.asarray(keyframes), :2]
+        S = (rows @ X[:, POSITION]).reshape(2 * m, -1)
+        P, later = S @ known.P_y @ S.T, np.empty((H.shape[1], 0))
+        for k in range(m - 1, -1, -1):
+            own = H[k][:, POSITION] @ rows[k].T
+            later = np.hstack([own, gains[k] @ later if k < m - 1 else later])
+            held = rows[k] @ later[POSITION]
+            P[2 * k : 2 * k + 2, 2 * k :] += held
+            P[2 * k + 2 :, 2 * k : 2 * k + 2] += held[:, 2:].T
+        for one in self._all_displaced(known.root):
+            u = one[np.asarray(keyframes)].ravel()
+            P += np.outer(u, u)
+        return P
+
     def draw(self, count: int, rng: np.random.Generator) -> Iterator[tuple[State, Array]]:
         """States at the IMU from the distribution, and the displacement of their positions in n, shape (n, 3)."""
         root, wide, believed = self._marginals().root, self.optimum.wide, self._believed

@@ -545,6 +545,9 @@ class Graph(ConfigSection):
     find_noise: bool = Field(
         True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
     )
+    crossovers: bool = Field(
+        False, description="correct the smoothed track where soundings of lines that cross or run again must agree"
+    )
 
     @property
     def ping_due_s(self) -> float:

@@ -1,0 +1,256 @@
+"""Crossovers of surveys whose truth is known: wrong matches, what they gain, and their NEES.
+
+python benchmarks/crossovers.py --surveys 20
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from rovgraph.geometry import Array
+from rovgraph.inference.crossovers import Drift, lines_of, match
+
+KNOT_S = 10.0
+
+
+def path(lines: int = 12, length: float = 500.0, apart: float = 25.0, crosslines: int = 4) -> Array:
+    """Places a metre, or a second, apart: lines to and fro, then crosslines; shape (n, 2)."""
+    width, corners = (lines - 1) * apart, []
+    for k in range(lines):
+        ends = [(0.0, k * apart), (length, k * apart)]
+        corners += ends if k % 2 == 0 else ends[::-1]
+    over = 25.0
+    for k in range(crosslines):
+        north = length * (k + 0.5) / crosslines
+        ends = [(north, width + over), (north, -over)]
+        corners += ends if k % 2 == 0 else ends[::-1]
+    points = [np.array(corners[0], float)]
+    radius = 10.0
+    for a, b, c in zip(corners, corners[1:], corners[2:], strict=False):
+        a, b, c = (np.array(x, float) for x in (a, b, c))
+        u, v = (b - a) / np.linalg.norm(b - a), (c - b) / np.linalg.norm(c - b)
+        begin, end = b - u * radius, b + v * radius
+        s = np.linspace(0.0, 1.0, 9)[:, None]
+        points += list((1 - s) ** 2 * begin + 2 * s * (1 - s) * b + s**2 * end)
+    points.append(np.array(corners[-1], float))
+    p = np.array(points)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    at = np.arange(0.0, arc[-1], 1.0)
+    return np.stack([np.interp(at, arc, axis) for axis in p.T], axis=-1)
+
+
+@dataclass
+class Terrain:
+    """Depths on a grid of cells of half a metre about the survey."""
+
+    depth: Array
+    origin: tuple[float, float] = (-100.0, -100.0)
+    cell: float = 0.5
+
+    def __call__(self, place: Array) -> Array:
+        where = ((place - self.origin) / self.cell).reshape(-1, 2).T
+        return np.asarray(map_coordinates(self.depth, where, order=1, mode="nearest")).reshape(place.shape[:-1])
+
+
+def spectrum(rng: np.random.Generator, shape: tuple[int, int], sd: float, density: Callable[[Array], Array]) -> Array:
+    """A Gaussian field by its spectral density over the wave number [rad/m]."""
+    k = [2.0 * np.pi * np.fft.fftfreq(n, 0.5) for n in shape]
+    S = density(np.hypot(k[0][:, None], k[1][None]))
+    values = np.fft.ifft2(np.fft.fft2(rng.standard_normal(shape)) * np.sqrt(S)).real
+    return np.asarray(sd * values / values.std())
+
+
+SHAPE = (1400, 1000)
+
+
+def matern(rng: np.random.Generator, sd: float = 0.35, length: float = 4.5) -> Terrain:
+    return Terrain(20.0 + spectrum(rng, SHAPE, sd, lambda k: (3.0 / length**2 + k**2) ** -2.5))
+
+
+def flat(rng: np.random.Generator) -> Terrain:
+    return Terrain(np.full(SHAPE, 20.0))
+
+
+def waves(rng: np.random.Generator) -> Terrain:
+    """Sand waves of one wavelength, of 0.35 m sd."""
+    length, bearing = rng.uniform(12.0, 20.0), rng.uniform(0.0, np.pi)
+    x = (np.arange(SHAPE[0])[:, None] * np.cos(bearing) + np.arange(SHAPE[1])[None] * np.sin(bearing)) * 0.5
+    return Terrain(20.0 + 0.5 * np.sin(2.0 * np.pi * x / length + rng.uniform(0.0, 6.28)))
+
+
+def other_relief(rng: np.random.Generator) -> Terrain:
+    """Relief that no Matern describes: ridges on one half, boulders on the other, a smooth swell."""
+    swell = spectrum(rng, SHAPE, 0.4, lambda k: np.exp(-((k * 20.0) ** 2)))
+    ridged = np.abs(spectrum(rng, SHAPE, 0.5, lambda k: np.exp(-((k * 4.0) ** 2))))
+    boulders = np.maximum(spectrum(rng, SHAPE, 1.0, lambda k: np.exp(-((k * 1.0) ** 2))) - 2.0, 0.0)
+    half = np.linspace(0.0, 1.0, SHAPE[0])[:, None]
+    return Terrain(20.0 + swell + half * ridged - (1.0 - half) * boulders)
+
+
+@dataclass
+class Drifting:
+    """What a track's error is made of: sds of constants, and of a heading that wanders.
+
+    Attributes
+    ----------
+    heading, deviation : constants [deg]; scale
+    wander, wander_s : [deg, s]
+    velocity : white, of the speed over ground [m/s/rtHz]
+    """
+
+    heading: float = 0.0
+    deviation: float = 0.0
+    scale: float = 0.0
+    wander: float = 0.5
+    wander_s: float = 900.0
+    velocity: float = 0.005
+
+    def covariance(self, p: Array) -> Array:
+        """Of north and east at every `KNOT_S`-th place, shape (2 m, 2 m)."""
+        d = np.diff(p[:: int(KNOT_S)], axis=0)
+        m = len(d)
+        turned, psi = np.stack([-d[:, 1], d[:, 0]], axis=-1), np.arctan2(d[:, 1], d[:, 0])
+        constants = [
+            np.deg2rad(self.heading) * turned,
+            np.deg2rad(self.deviation) * turned * np.sin(psi)[:, None],
+            np.deg2rad(self.deviation) * turned * np.cos(psi)[:, None],
+            self.scale * d,
+        ]
+        t = KNOT_S * np.arange(m)
+        K = np.deg2rad(self.wander) ** 2 * np.exp(-np.abs(t[:, None] - t) / self.wander_s)
+        steps = np.einsum("ia,ij,jb->iajb", turned, K, turned).reshape(2 * m, 2 * m)
+        steps += sum(np.outer(c.ravel(), c.ravel()) for c in constants)
+        steps += self.velocity**2 * KNOT_S * np.eye(2 * m)
+        total = np.kron(np.tril(np.ones((m, m))), np.eye(2))
+        P = np.zeros((2 * m + 2, 2 * m + 2))
+        P[2:, 2:] = total @ steps @ total.T
+        return P + 0.01 * np.kron(np.ones((m + 1, m + 1)), np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
+
+
+MTI = Drifting(heading=0.5, deviation=0.5, scale=0.003)
+KNOWN = Drifting(heading=0.1, deviation=0.1, scale=0.0006)
+WANDER = Drifting()
+SLOW = Drifting(wander=1.0, wander_s=3600.0)
+CONSTANTS = Drifting(heading=0.3, scale=0.004, wander=0.0)
+FOG = Drifting(wander=0.1, wander_s=3600.0)
+
+
+@dataclass
+class Case:
+    """A row of the table."""
+
+    drift: Drifting = field(default_factory=lambda: WANDER)
+    terrain: Callable[[np.random.Generator], Terrain] = matern
+    noise: float = 0.14
+    tide: float = 0.0
+    fish: float = 0.0
+    altimeter: bool = False
+
+
+CASES = {
+    "MTi with compass": Case(MTI),
+    "constants five times better": Case(KNOWN),
+    "heading 0.5 deg, 15 min": Case(WANDER),
+    "heading 1 deg, 1 h": Case(SLOW),
+    "constants only": Case(CONSTANTS),
+    "FOG": Case(FOG),
+    "altimeter": Case(WANDER, altimeter=True),
+    "flat bottom": Case(MTI, flat),
+    "sand waves": Case(MTI, waves),
+    "other relief": Case(MTI, other_relief),
+    "fish school": Case(MTI, fish=0.15),
+    "tide": Case(MTI, tide=1.5),
+}
+
+
+@dataclass
+class Outcome:
+    before: float
+    after: float
+    nees: float
+    ties: int
+    wrong: int
+    nees_ties: float
+    seconds: float
+    text: str
+
+
+def survey(case: Case, seed: int) -> Outcome:
+    rng = np.random.default_rng([43, seed])
+    p = path()
+    t = np.arange(len(p), dtype=float)
+    knots = t[:: int(KNOT_S)]
+    P = case.drift.covariance(p)[: 2 * len(knots), : 2 * len(knots)]
+    e = np.linalg.cholesky(P) @ rng.standard_normal(len(P))
+    error = np.stack([np.interp(t, knots, axis) for axis in e.reshape(-1, 2).T], axis=-1)
+    terrain = case.terrain(rng)
+    way = np.gradient(p, axis=0)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    side = np.stack([-way[:, 1], way[:, 0]], axis=-1)
+    reach = 0.0 if case.altimeter else 10.0 * np.tan(np.deg2rad(22.5)) / np.sqrt(2.0)
+    signs = [(0.0, 0.0)] if case.altimeter else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+    arm = np.stack([reach * (a * way + b * side) for a, b in signs], axis=1)
+    depth = terrain(p[:, None] + arm) + rng.normal(0.0, case.noise, arm.shape[:2])
+    depth += case.tide * np.sin(2.0 * np.pi * t / 10000.0)[:, None]
+    if case.fish:
+        inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
+        depth -= inside[:, None] * rng.uniform(0.0, 4.0, depth.shape)
+    estimated = p - error
+    place = estimated[:, None] + arm
+    heading = np.arctan2(way[:, 1], way[:, 0])
+    begin = time.perf_counter()
+    lines = lines_of(t, heading, estimated, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
+    found = match(lines, Drift(knots, np.zeros(len(P)), P))
+    seconds = time.perf_counter() - begin
+    left = e if not found.ties else e - (after := Drift(knots, np.zeros(len(P)), P).tied(found.ties)).mean
+    nees = 0.0
+    pairs = np.array([tie.knots for tie in found.ties], int).reshape(-1, 2)
+    shifts, rest = (x.reshape(-1, 2)[pairs[:, 0]] - x.reshape(-1, 2)[pairs[:, 1]] for x in (e, left))
+    off = shifts - np.array([tie.shift for tie in found.ties]).reshape(-1, 2)
+    wrong = int((np.linalg.norm(rest, axis=1) > 3.0).sum())
+    nees_ties = np.nan
+    if found.ties:
+        each = [after.P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(1, len(knots))]
+        nees = float(
+            np.mean(
+                [
+                    left[2 * k : 2 * k + 2] @ np.linalg.solve(C, left[2 * k : 2 * k + 2]) / 2
+                    for k, C in enumerate(each, 1)
+                ]
+            )
+        )
+        nees_ties = float(np.mean([o @ tie.information @ o / 2 for o, tie in zip(off, found.ties, strict=True)]))
+    rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
+    return Outcome(rms[0], rms[1], nees, len(found.ties), wrong, nees_ties, seconds, f"{found.text} {found.relief}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rows", nargs="*", default=list(CASES))
+    parser.add_argument("--surveys", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--verbose", action="store_true")
+    given = parser.parse_args()
+    for name in given.rows:
+        out = [survey(CASES[name], given.first + k) for k in range(given.surveys)]
+        if given.verbose:
+            for o in out:
+                print("   ", o)
+        before, after = (np.sqrt(np.mean([getattr(o, n) ** 2 for o in out])) for n in ("before", "after"))
+        some = [o for o in out if o.ties]
+        print(
+            f"| {name} | {before:.1f} | {after:.1f} | {after / before:.2f} | {len(some)} of {len(out)} | "
+            f"{sum(o.ties for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
+            f"{np.mean([o.nees for o in some]) if some else np.nan:.2f} | "
+            f"{np.nanmean([o.nees_ties for o in some]) if some else np.nan:.2f} | "
+            f"{np.mean([o.seconds for o in out]):.1f} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
