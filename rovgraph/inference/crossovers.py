@@ -133,7 +133,8 @@ def _cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
     mean = mean[count >= 0.25 * np.median(count)] if len(count) else mean
-    return Line(mean[:, 0], *np.round(mean[:, 1:3].T).astype(np.int64), mean[:, 3:5], mean[:, 5])
+    along, across = np.round(mean[:, 1:3].T).astype(np.int64)
+    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5])
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ class Relief:
 
 def _matern(r: Array) -> Array:
     q = np.sqrt(3.0) * r
-    return (1.0 + q) * np.exp(-q)
+    return np.asarray((1.0 + q) * np.exp(-q))
 
 
 def fit_relief(lines: Sequence[Line]) -> Relief:
@@ -470,7 +471,7 @@ class _Field:
 
 def _of_plane(p: Array, sd: float) -> Array:
     away = p - p.mean(axis=0)
-    return (PLANE * sd) ** 2 + SLOPE**2 * away @ away.T
+    return np.asarray((PLANE * sd) ** 2 + SLOPE**2 * away @ away.T)
 
 
 def _apart(x: Array, y: Array) -> Array:
@@ -618,7 +619,7 @@ class _Search:
 
 def _robust(field: Array) -> Array:
     """A field of soundings that may be no bottom's."""
-    return np.logaddexp(np.log1p(-FALSE) + field, np.log(FALSE))
+    return np.asarray(np.logaddexp(np.log1p(-FALSE) + field, np.log(FALSE)))
 
 
 def _peaks(values: Array) -> NDArray[np.bool_]:
@@ -634,7 +635,8 @@ def _peaks(values: Array) -> NDArray[np.bool_]:
 
 def _clearest_first(P: Array) -> list[int]:
     """An order of crossings: next comes what those before predict best."""
-    left, order = P.copy(), []
+    left = P.copy()
+    order: list[int] = []
     count = len(P) // 2
     while len(order) < count:
         unsure = [np.inf if k in order else left[2 * k, 2 * k] + left[2 * k + 1, 2 * k + 1] for k in range(count)]
@@ -666,5 +668,5 @@ def _most_alike(lines: Sequence[Line], relief: Relief, far: float) -> float:
                 product[lag] += u[both] @ v[both]
                 square[lag] += 0.5 * (u[both] @ u[both] + v[both] @ v[both])
                 pairs[lag] += both.sum()
-    known = pairs > 15
-    return float((product[known] / np.maximum(square[known], 1e-12)).max()) if known.any() else 0.0
+    enough = pairs > 15
+    return float((product[enough] / np.maximum(square[enough], 1e-12)).max()) if enough.any() else 0.0

@@ -209,8 +209,9 @@ class Measurements:
     def model(self) -> SensorModel:
         """Their model, with what was known of the other ends, or of the beams."""
         model = self.instrument.model
-        with_context = isinstance(model, AcousticExchange | DvlBeam | WaterLayer)
-        return model.of(self.problem.contexts(self.index)) if with_context else model
+        if isinstance(model, AcousticExchange | DvlBeam | WaterLayer):
+            return model.of(self.problem.contexts(self.index))
+        return model
 
     # predictions
 
