@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
+from rovgraph.model.origin import origin_in
 from rovgraph.model.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
@@ -18,6 +19,8 @@ Readmission = Annotated[
     Field(gt=0, description="after this long a rejected sensor is used again; a filter first inflates its covariance"),
 ]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
+HIGHEST_LATITUDE_DEG = 85.0  # of an origin in frame "earth"
+SAME_LATITUDE_DEG = 0.1  # by which two statements of it may differ
 NotNegative = Annotated[float, Field(ge=0)]
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
@@ -77,7 +80,13 @@ class Environment(ConfigSection):
     origin_lon_deg: Annotated[float, Field(ge=-180, le=360)] | None = Field(
         None, description="longitude of north = east = 0, east positive"
     )
-    latitude_deg: Latitude | None = Field(None, description="latitude, for Earth rotation; null = of the origin")
+    latitude_deg: Latitude | None = Field(
+        None, description="latitude, for the Earth's rotation and frame earth; null = of the origin"
+    )
+    frame: Literal["flat", "earth"] = Field(
+        "flat",
+        description="north and east on a plane, or as latitude and longitude on WGS 84 at the origin's scale (earth)",
+    )
     declination_deg: float = Field(0.0, description="magnetic declination, east positive")
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
@@ -93,11 +102,33 @@ class Environment(ConfigSection):
             raise PydanticCustomError("half", "expected both origin_lat_deg and origin_lon_deg, or neither")
         return self
 
+    @model_validator(mode="after")
+    def _whole_earth(self) -> Self:
+        if self.frame != "earth":
+            return self
+        latitude, origin = self.latitude_deg, self.origin_lat_deg
+        if latitude is not None and origin is not None and abs(latitude - origin) > SAME_LATITUDE_DEG:
+            text = "frame: earth takes the latitude of the origin, {o} deg; remove latitude_deg = {l}, or correct it"
+            raise PydanticCustomError("two", text, {"o": f"{origin:g}", "l": f"{latitude:g}"})
+        for stated in (latitude, origin):
+            if stated is not None and abs(stated) > HIGHEST_LATITUDE_DEG:
+                text = "frame: earth reaches to latitude {h} deg, and {l} is beyond; state frame: flat"
+                raise PydanticCustomError("pole", text, {"h": f"{HIGHEST_LATITUDE_DEG:g}", "l": f"{stated:g}"})
+        return self
+
     @property
     def origin(self) -> tuple[float, float] | None:
         """Latitude and longitude [deg] of north = east = 0, where they are stated."""
         lat, lon = self.origin_lat_deg, self.origin_lon_deg
-        return None if lat is None or lon is None else (lat, lon)
+        return None if lat is None or lon is None else origin_in(self.frame, lat, lon)
+
+    @property
+    def earth_latitude(self) -> float:
+        """Latitude of the origin of frame "earth" [rad]; NaN in a flat one."""
+        if self.frame != "earth":
+            return np.nan
+        lat = self.latitude_deg if self.origin_lat_deg is None else self.origin_lat_deg
+        return np.nan if lat is None else float(np.deg2rad(lat))
 
 
 class ImuNoise(ConfigSection):
