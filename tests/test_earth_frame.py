@@ -1,5 +1,6 @@
 """Frame "earth": dives on WGS 84, kilometres from their origin, against a way over ground that is known."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def config(**environment: object) -> dict[str, object]:
 def smoothed(folder: Path, latitude: float, longitude: float, seconds: float) -> tuple[rovgraph.Result, Array]:
     log, truth = transit(latitude, longitude, seconds)
     log.to_csv(folder / "log.csv", index=False, float_format="%.12g")
-    result = rovgraph.smooth(folder / "log.csv", rovgraph.parse_config(config()))
+    result = rovgraph.smooth(folder / "log.csv", rovgraph.parse_config(json.dumps(config())))
     at = np.interp(result.trajectory.time, log["time"], np.arange(len(log))).round().astype(int)
     return result, truth[at]
 
@@ -101,4 +102,4 @@ def test_a_transit_across_the_date_line_ends_where_it_did(tmp_path):
 )
 def test_contradictions_are_refused(environment, said):
     with pytest.raises(InputError, match=said):
-        rovgraph.parse_config(config(**environment))
+        rovgraph.parse_config(json.dumps(config(**environment)))

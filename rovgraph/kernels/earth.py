@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rovgraph.geometry import EARTH_RATE, Array
+from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper
 
 Number = TypeVar("Number", float, Array)

@@ -13,8 +13,8 @@ On a turning Earth this holds in the axes that n has at the beginning, for v + S
 is turned back by Exp(-t w), and gravity turns meanwhile. Equal to GTSAM's ``PreintegratedCombinedMeasurements``.
 
 **In frame "earth"** (`rovgraph.kernels.earth`) the axes of n follow the vehicle: they turn by w_in = w_ie + w_en, the
-Earth's rate and the transport rate (v_east / (N + h), -v_north / (M + h), -v_east tan lat / (N + h)), and north and east
-are angles (Groves 2013, 5.4). In the axes that n has at the beginning, held still, with the ground speed u and its
+Earth's rate and the transport rate (v_east / (N + h), -v_north / (M + h), -v_east tan lat / (N + h)), north and
+east are angles (Groves 2013, 5.4). In the axes that n has at the beginning, held still, with the ground speed u and its
 integral s,
 
     u' = R f + g - w_ie x u,    so    u = v_i + V - w_ie x s,    s = t v_i + P - w_ie x (t^2/2 v_i + t/3 P)
