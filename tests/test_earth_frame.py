@@ -50,7 +50,7 @@ def config(**environment: object) -> dict[str, object]:
         "environment": {"frame": "earth", **environment},
         "imu": {"noise": {"acc": 1e-4, "gyr": 1e-6, "acc_walk": 1e-7, "gyr_walk": 1e-10},
                 "acc_bias_sd_mps2": 1e-4, "gyr_bias_sd_dps": 1e-5},
-        "dvl": {"sd": 0.002},
+        "dvl": {"velocity_sd_mps": [0.002, 0.002, 0.002]},
         "start": {"heading_deg": 60.0, "heading_sd_deg": 0.1, "roll_deg": 0.0, "pitch_deg": 0.0},
     }  # fmt: skip
 
@@ -58,14 +58,15 @@ def config(**environment: object) -> dict[str, object]:
 def smoothed(folder: Path, latitude: float, longitude: float, seconds: float) -> tuple[rovgraph.Result, Array]:
     log, truth = transit(latitude, longitude, seconds)
     log.to_csv(folder / "log.csv", index=False, float_format="%.12g")
-    result = rovgraph.smooth(folder / "log.csv", rovgraph.parse_config(json.dumps(config())))
-    at = np.interp(result.trajectory.time, log["time"], np.arange(len(log))).round().astype(int)
+    settings = rovgraph.parse_config(json.dumps(config()))
+    result = rovgraph.smooth(rovgraph.read_log(folder / "log.csv", settings), settings)
+    at = np.interp(result.smoothed.trajectory.time, log["time"], np.arange(len(log))).round().astype(int)
     return result, truth[at]
 
 
 def apart(result: rovgraph.Result, truth: Array) -> float:
     """Farthest from the truth [m]."""
-    lat, lon = result.trajectory.geodetic(result.log.origin)
+    lat, lon = result.smoothed.trajectory.geodetic(result.log.origin)
     M, N = radii(np.deg2rad(truth[:, 0]))
     east = np.deg2rad((lon - truth[:, 1] + 180.0) % 360.0 - 180.0) * N * np.cos(np.deg2rad(truth[:, 0]))
     return float(np.hypot(np.deg2rad(lat - truth[:, 0]) * M, east).max())
