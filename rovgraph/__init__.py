@@ -5,7 +5,9 @@ This docstring is the contract for frames, units and names in the whole package.
 Frames
 ------
 n : navigation frame, north-east-down (NED), flat, local origin, taken as inertial
-    unless ``environment.earth_rotation`` is set.
+    unless ``environment.earth_rotation`` is set. With ``environment.frame: earth`` its axes
+    are those of the meridian where the vehicle is, and north and east are latitude and
+    longitude on WGS 84, as metres at the scale of the origin.
 b : body frame, forward-right-down (FRD): x forward, y starboard, z down.
 s : sensor frame. A sensor's mounting is ``R_bs`` (sensor to body, written
     ``mount_rpy_deg`` in a configuration) and ``lever_arm_b`` (metres, body axes).

@@ -319,20 +319,6 @@ def earth_rate_n(latitude: float) -> Array:
 
 
 EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
-BY_DEPTH = 2.22e-6  # growth of gravity going down in the sea [1/s^2]: free air 3.08e-6, less 4 pi G 1025 kg/m^3
-
-
-def normal_gravity(latitude: ArrayLike, depth: ArrayLike = 0.0) -> Array:
-    """Gravity at and below the sea's surface [m/s^2], Somigliana's formula of WGS 84; shape of the arguments together.
-
-    Parameters
-    ----------
-    latitude : [rad]
-    depth : [m]
-    """
-    square = np.sin(latitude) ** 2
-    surface = 9.7803253359 * (1.0 + 0.00193185265241 * square) / np.sqrt(1.0 - 0.00669437999013 * square)
-    return np.asarray(surface + BY_DEPTH * np.asarray(depth))
 
 
 def signed_permutations() -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.kernels.earth import radii
 from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD, transitions
 from rovgraph.kernels.motion_residual import (
     motion_covariance,
@@ -28,6 +29,7 @@ from rovgraph.kernels.motion_row import (
     EARTH_RATE,
     GAP,
     GRAVITY,
+    LATITUDE,
     NO_IMU,
     NOISE,
     ROW,
@@ -414,3 +416,41 @@ def test_kernels_are_plain_python_without_the_compiler():
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-k", some, str(Path(__file__))]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout[-2000:]
+
+
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
+@pytest.mark.parametrize("latitude", [0.0, 45.0, 70.0, -60.0, 84.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_on_earth_derivatives_are_those_of_the_values(seed, latitude, gap):
+    """100 km from the origin; what latitude changes of rates and radii in one interval is left out."""
+    case = calm(seed, EARTH)
+    motion, _ = case.integrated(gap)
+    motion.row[LATITUDE] = np.deg2rad(latitude)
+    before = ends(4, case.bias)
+    before = replace(before, p=before.p + np.array([1e5, -2e4, 30.0]), v=before.v + np.array([2.0, 1.0, 0.0]))
+    there, F, _ = transition(motion, before)
+    after = there.moved(0.2 * np.random.default_rng(5).normal(size=(1, 15)))
+    _, A_i, A_j = error(motion, before, after)
+    close(A_i, derivative(lambda d: error(motion, before.moved(d), after)[0], 1e-3), 1e-7 if gap == 0.0 else 2e-6)
+    close(A_j, derivative(lambda d: error(motion, before, after.moved(d))[0], 1e-3), 1e-7)
+    r, A_i, A_j = error(motion, before, there)
+    np.testing.assert_allclose(r, 0.0, atol=1e-9)
+    close(F, -np.linalg.inv(A_j) @ A_i, 1e-8)
+
+
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
+def test_on_earth_a_degree_is_a_degree(gap):
+    """The way over ground, against radii of curvature where the vehicle is; the axes follow the meridian."""
+    case = replace(calm(0, EARTH), bias=np.zeros(6))
+    motion, _ = case.integrated(gap)
+    motion.row[LATITUDE] = np.deg2rad(60.0)
+    before = ends(4, case.bias)
+    before = replace(before, p=np.array([[1e5, 5e4, 0.0]]), v=np.array([[2.0, 3.0, 0.0]]), bias=np.zeros((1, 6)))
+    there = predict(motion, before)
+    M_0, N_0 = radii(np.deg2rad(60.0))
+    latitude = np.deg2rad(60.0) + 1e5 / M_0
+    M, N = radii(latitude)
+    way = 0.5 * motion.row[DURATION] * (before.v + there.v)[0]
+    scale = np.array([M_0 / M, N_0 * 0.5 / (N * np.cos(latitude)), 1.0])
+    np.testing.assert_allclose((there.p - before.p)[0, :2], (scale * way)[:2], rtol=2e-3 if gap == 0.0 else 1e-6)
+    assert scale[1] > 1.02

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import rovgraph as rg
-from rovgraph.geometry import Array, normal_gravity
+from rovgraph.geometry import Array
+from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, normal_gravity
 from rovgraph.live.intake import Intake
 from rovgraph.live.message import Reading
 from rovgraph.log import Log
@@ -22,7 +23,7 @@ def dive(
 ) -> tuple[Array, Array]:
     """Depth and pressure in sea water at latitude 60, at the surface before ``begin`` and after ``end`` [s]."""
     depth = deepest * np.clip(np.minimum(TIME - begin, end - TIME) / 100.0, 0.0, 1.0)
-    gravity = normal_gravity(np.deg2rad(60.0), 0.5 * depth)
+    gravity = normal_gravity(np.deg2rad(60.0)) + GRAVITY_PER_DEPTH * 0.5 * depth
     return depth, air + 1025.0 * gravity * depth
 
 

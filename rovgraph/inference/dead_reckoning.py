@@ -17,6 +17,7 @@ from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity
 from rovgraph.inference.initialise import by_accuracy, solve_turn, turn_noise
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.dead_reckoning import Aiding, LevelStart, Motions, Surroundings, reckon_attitude
+from rovgraph.kernels.earth import latitude_at, scales
 from rovgraph.kernels.measurement_row import ASSUMED, DP, DR, DT, DV, RATE, RATE_SD, TIME
 from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.model.config import Config, beliefs
@@ -111,7 +112,15 @@ def dead_reckon(problem: Problem, initial: InitialConditions, calibration: Mappi
     v_n = _velocities(epochs, R_nb, bias, bottom, water, calibration["current"])
     step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(epochs.time)[:, None]
     k = epochs.keyframe
-    p_n = (initial.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
+    began, latitude = initial.prior.state.p_n[0], initial.config.environment.earth_latitude
+    p_n = began + np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
+    if not np.isnan(latitude):
+        for _ in range(2):  # the scales are those of where it is
+            middle = 0.5 * (p_n[1:] + p_n[:-1])
+            north, east = scales(latitude, latitude_at(latitude, middle[:, 0]), middle[:, 2])
+            scaled = step * np.column_stack([north, east, np.ones(len(step))])
+            p_n = began + np.vstack([np.zeros(3), np.cumsum(scaled, axis=0)])
+    p_n = p_n[k]
     p_n[:, 2] = _depths(problem, p_n[:, 2], R_nb[k], initial, calibration)
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 

@@ -32,12 +32,13 @@ from rovgraph.geometry import (
 )
 from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_compass
 from rovgraph.kernels.assembly import NOISIER
+from rovgraph.kernels.earth import normal_gravity
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import CLEAR_SPEED
 from rovgraph.log.reading import water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
-from rovgraph.model.config_sections import Environment
+from rovgraph.model.config_sections import HIGHEST_LATITUDE_DEG, Environment
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
@@ -590,8 +591,10 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             f"environment.declination_deg {field.declination_deg:.2f} within {field.declination_sd_deg:.1f} deg, by "
             f"WMM2025 at the origin and the date of the log{', which the model does not reach' * field.expired}"
         )
-    if env.latitude_deg is None and log.origin is not None:
+    if log.origin is not None and (env.latitude_deg is None or env.frame == "earth"):
         changes["latitude_deg"] = log.origin[0]
+    if env.frame == "earth":
+        changes |= _on_earth(log, config, assumptions)
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
         raise InputError(
             "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
@@ -626,6 +629,42 @@ def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str])
         f"{depth:.0f} m"
     )
     return gravity
+
+
+def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, object]:
+    """What frame "earth" sets: the Earth's rotation, and gravity at the origin where it is not stated.
+
+    Raises
+    ------
+    InputError : the latitude is unknown; what the frame does not take yet
+    """
+    env, latitude = config.environment, config.environment.latitude_deg if log.origin is None else log.origin[0]
+    if latitude is None:
+        raise InputError(
+            "environment.frame: earth needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
+        )
+    if abs(latitude) > HIGHEST_LATITUDE_DEG:
+        raise InputError(
+            f"environment.frame: earth reaches to latitude {HIGHEST_LATITUDE_DEG:g} deg, and the origin is at "
+            f"{latitude:.4g}; state environment.frame: flat"
+        )
+    if heard := sorted(log.sensors & {*ACOUSTICS}):
+        raise InputError(
+            f"environment.frame: earth does not take acoustic positions and ranges yet, and the log has {heard[0]}; "
+            "state environment.frame: flat, or leave these columns out"
+        )
+    if has_constant_velocity(config):
+        changes: dict[str, object] = {}
+    elif "earth_rotation" in env.model_fields_set and not env.earth_rotation:
+        raise InputError("environment.frame: earth turns with the Earth; remove environment.earth_rotation: false")
+    else:
+        changes = {"earth_rotation": True}
+    text = f"frame earth: WGS 84 at latitude {latitude:.4g} deg, with the Earth's rotation"
+    if env.gravity_mps2 is None:
+        changes["gravity_mps2"] = normal_gravity(float(np.deg2rad(latitude)))
+        text += f" and normal gravity, {changes['gravity_mps2']:.5f} m/s2 at the origin"
+    assumptions.append(text)
+    return changes
 
 
 def sample_density(time: Array, samples: Array) -> float:

@@ -30,6 +30,7 @@ from rovgraph.geometry import (
 )
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
+from rovgraph.model.origin import lat_lon
 
 if TYPE_CHECKING:
     import xarray
@@ -245,10 +246,7 @@ class Trajectory:
         ----------
         origin : latitude and longitude [deg] of north = east = 0
         """
-        from pymap3d import ned2geodetic
-
-        lat, lon, _ = ned2geodetic(self.p_n[:, 0], self.p_n[:, 1], 0.0, *origin, 0.0)
-        return lat, lon
+        return lat_lon(self.p_n[:, 0], self.p_n[:, 1], origin)
 
     def write_csv(
         self,

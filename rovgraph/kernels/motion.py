@@ -12,6 +12,20 @@ assumed one,
 On a turning Earth this holds in the axes that n has at the beginning, for v + S(w) p in place of v; what comes out
 is turned back by Exp(-t w), and gravity turns meanwhile. Equal to GTSAM's ``PreintegratedCombinedMeasurements``.
 
+**In frame "earth"** (`rovgraph.kernels.earth`) the axes of n follow the vehicle: they turn by w_in = w_ie + w_en, the
+Earth's rate and the transport rate (v_east / (N + h), -v_north / (M + h), -v_east tan lat / (N + h)), north and
+east are angles (Groves 2013, 5.4). In the axes that n has at the beginning, held still, with the ground speed u and its
+integral s,
+
+    u' = R f + g - w_ie x u,    so    u = v_i + V - w_ie x s,    s = t v_i + P - w_ie x (t^2/2 v_i + t/3 P)
+    d = s - w_in x (t^2/2 v_i + 2 t/3 P)
+    R_j = E R_i Exp(theta),  v_j = E u,  p_j = p_i + diag(k_north, k_east, 1) d,    E = Exp(-t w_in)
+
+with P, V what specific force and gravity do, the latter turning with n; d the way over ground along the axes of the
+moment; k of `rovgraph.kernels.earth.scales` in the middle of the way. Left out are terms of (w t)^2 v t, below a
+nanometre in a second. Gravity is that of the row at the origin, and changes as the normal one does with latitude and
+depth.
+
 **IMU outage**, where samples are missing for longer than `LONGEST_BRIDGED_S`. Integrating an interpolated specific
 force needs the attitude, and an error of an unmeasured attitude turns gravity into motion: after five seconds tens of
 metres, from which a linear filter does not recover. A vehicle that is heavy below and light above does not roll over
@@ -43,8 +57,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rovgraph.geometry import EARTH_RATE as OMEGA
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import Matrices, Matrix, helper, kernel, view_helper
+from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, latitude_at, normal_gravity, radii, scales
 from rovgraph.kernels.motion_row import (
     AFTER,
     BIAS,
@@ -53,6 +69,7 @@ from rovgraph.kernels.motion_row import (
     EARTH_RATE,
     GAP,
     GRAVITY,
+    LATITUDE,
     NO_IMU,
     NOISE,
     RESIDUAL,
@@ -120,14 +137,30 @@ def _predict_angles(row: Array, R: Array, rpy_out: Array) -> None:
     rpy_out[2] += math.atan2(turn[1, 0], turn[0, 0])
 
 
+@view_helper
+def _is_on_earth(row: Array) -> bool:
+    """Whether the motion is in frame "earth"."""
+    return not math.isnan(row[LATITUDE])
+
+
+@helper
+def _scale_of(row: Array, p: Array, v: Array) -> tuple[float, float, float]:
+    """What a metre along each axis of n changes position by, in the middle of a way at a velocity."""
+    if not _is_on_earth(row):
+        return 1.0, 1.0, 1.0
+    half = 0.5 * row[DURATION]
+    north, east = scales(row[LATITUDE], latitude_at(row[LATITUDE], p[0] + half * v[0]), p[2] + half * v[2])
+    return north, east, 1.0
+
+
 @helper
 def coast(row: Array, state: Epoch, out: Epoch) -> None:
     """Attitude, position and velocity at the end of an interval."""
-    rpy = np.empty(3)
+    rpy, k = np.empty(3), _scale_of(row, state.p, state.v)
     _predict_angles(row, state.R, rpy)
     _from_roll_pitch_yaw(rpy, out.R)
     for i in range(3):
-        out.p[i], out.v[i] = state.p[i] + row[DURATION] * state.v[i], state.v[i]
+        out.p[i], out.v[i] = state.p[i] + row[DURATION] * k[i] * state.v[i], state.v[i]
 
 
 @helper
@@ -154,6 +187,7 @@ def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
     known, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     kept, R_i, p_i, v_i, bias_i = _kept(row), before.R, before.p, before.v, before.b
     R_j, p_j, v_j, bias_j = after.R, after.p, after.v, after.b
+    k = _scale_of(row, p_i, v_i)
     roll_pitch_yaw(R_i, known)
     roll_pitch_yaw(R_j, rpy)
     _predict_angles(row, R_i, predicted)
@@ -164,9 +198,9 @@ def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
     for i in range(3):
         angle = rpy[i] - predicted[i]
         A_out[i, RESIDUAL] = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - row[DURATION] * v_i[i]
+        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - row[DURATION] * k[i] * v_i[i]
         A_out[6 + i, RESIDUAL] = v_j[i] - v_i[i]
-        A_out[3 + i, 6 + i] = -row[DURATION]
+        A_out[3 + i, 6 + i] = -row[DURATION] * k[i]
         for j in range(3):
             A_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
             A_out[i, AFTER + j] = B_j[i, j]
@@ -176,10 +210,10 @@ def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
 
 
 @helper
-def coasting_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Array) -> None:
-    """Linear transition and its noise, shape (15, 15), where ``R_j`` was predicted from ``R_i``."""
+def coasting_transition(row: Array, state: Epoch, R_j: Array, F_out: Array, Q_out: Array) -> None:
+    """Linear transition and its noise, shape (15, 15), where ``R_j`` was predicted from a state."""
     before, rpy, B, back = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    kept, t = _kept(row), row[DURATION]
+    kept, t, R_i, k = _kept(row), row[DURATION], state.R, _scale_of(row, state.p, state.v)
     roll_pitch_yaw(R_i, before)
     roll_pitch_yaw(R_j, rpy)
     _by_turn(before, B)
@@ -197,7 +231,7 @@ def coasting_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out:
         for j in range(3):
             F_out[i, j] = kept * (back[i, 0] * B[0, j] + back[i, 1] * B[1, j]) + back[i, 2] * B[2, j]
             F_out[3 + i, 3 + j] = R_j[0, i] * R_i[0, j] + R_j[1, i] * R_i[1, j] + R_j[2, i] * R_i[2, j]
-            F_out[3 + i, 6 + j] = t * R_j[j, i]
+            F_out[3 + i, 6 + j] = t * k[j] * R_j[j, i]
             Q_out[i, j] = tilt * (back[i, 0] * back[j, 0] + back[i, 1] * back[j, 1]) + heading * back[i, 2] * back[j, 2]
             Q_out[3 + i, 6 + j] = Q_out[6 + j, 3 + i] = both * R_j[j, i]
 
@@ -205,8 +239,9 @@ def coasting_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out:
 @helper
 def cruise(row: Array, state: Epoch, out: Epoch) -> None:
     """Attitude, position and velocity at the end of an interval."""
+    k = _scale_of(row, state.p, state.v)
     for i in range(3):
-        out.p[i], out.v[i] = state.p[i] + row[DURATION] * state.v[i], state.v[i]
+        out.p[i], out.v[i] = state.p[i] + row[DURATION] * k[i] * state.v[i], state.v[i]
         for j in range(3):
             out.R[i, j] = state.R[i, j]
 
@@ -242,6 +277,7 @@ def cruising_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
     )
     R_i, p_i, v_i, bias_i = before.R, before.p, before.v, before.b
     R_j, p_j, v_j, bias_j = after.R, after.p, after.v, after.b
+    k = _scale_of(row, p_i, v_i)
     multiply_transposed(R_i, R_j, turn)
     log_rotation(turn, phi)
     inverse_right_jacobian(phi, Jr)
@@ -253,9 +289,9 @@ def cruising_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
         A_out[i, i], A_out[i, AFTER + i] = -1.0, 1.0
     for i in range(3):
         A_out[i, RESIDUAL] = phi[i]
-        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - half * (v_i[i] + v_j[i])
+        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - half * k[i] * (v_i[i] + v_j[i])
         A_out[6 + i, RESIDUAL] = u[1, i] - u[0, i]
-        A_out[3 + i, 6 + i] = A_out[3 + i, AFTER + 6 + i] = -half
+        A_out[3 + i, 6 + i] = A_out[3 + i, AFTER + 6 + i] = -half * k[i]
         for j in range(3):
             A_out[i, j], A_out[i, AFTER + j] = -Jr[j, i], Jr[i, j]  # Jl^-1 is Jr^-1 transposed
             A_out[3 + i, 3 + j], A_out[3 + i, AFTER + 3 + j] = -R_i[i, j], R_j[i, j]
@@ -266,13 +302,14 @@ def cruising_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
 
 
 @helper
-def cruising_transition(row: Array, R: Array, v: Array, F_out: Array, Q_out: Array) -> None:
+def cruising_transition(row: Array, state: Epoch, F_out: Array, Q_out: Array) -> None:
     """Linear transition and its noise, shape (15, 15), from a state to the predicted one, which has its attitude.
 
     With the noise (w, x, y) of rotation, position and velocity u, velocity errs by R (y - u x w) more, and position in
     the body's axes by x and half the time of that.
     """
     half, u, U, RU = 0.5 * row[DURATION], np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    R, v, scale = state.R, state.v, _scale_of(row, state.p, state.v)
     cruising_covariance(row, Q_out)
     turns, drifts, speeds = Q_out[0, 0], Q_out[3, 3], Q_out[6, 6]
     rotate_back(R, v, u)
@@ -284,7 +321,7 @@ def cruising_transition(row: Array, R: Array, v: Array, F_out: Array, Q_out: Arr
         F_out[i, i] = 1.0
     for i in range(3):
         for j in range(3):
-            F_out[3 + i, 6 + j] = 2.0 * half * R[j, i]
+            F_out[3 + i, 6 + j] = 2.0 * half * scale[j] * R[j, i]
             across = 0.0  # of u x w, in the body's axes and in n
             across_n = 0.0
             mixed = 0.0
@@ -311,7 +348,7 @@ class MotionScratch(NamedTuple):
     zeta : shape (9,), the motion, corrected for the bias
     turn : shape (3, 3), Exp(theta)
     E, ER : shapes (3, 3), the rotation by which the axes of n turn back meanwhile, and of the body's after it
-    vectors, matrices : shapes (5, 3), (4, 3, 3)
+    vectors, matrices : shapes (8, 3), (4, 3, 3)
     J : shape (9, 15), derivative by the state before, of `predict_with_jacobian`
     """
 
@@ -328,7 +365,7 @@ class MotionScratch(NamedTuple):
 def make_motion_scratch() -> MotionScratch:
     """Arrays for all motions of a dive; made once."""
     turns = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    return MotionScratch(np.empty(9), *turns, np.empty((5, 3)), np.empty((4, 3, 3)), np.empty((9, 15)))
+    return MotionScratch(np.empty(9), *turns, np.empty((8, 3)), np.empty((4, 3, 3)), np.empty((9, 15)))
 
 
 @view_helper
@@ -353,9 +390,8 @@ def correct_motion(row: Array, bias: Array, zeta_out: Array) -> None:
 
 
 @view_helper
-def _gravity(row: Array, rate: Array, once: Array, twice: Array, p_out: Array, v_out: Array) -> None:
-    """Add to position and velocity what gravity does while n turns at a rate."""
-    t, g = row[DURATION], row[GRAVITY]
+def _gravity(t: float, g: float, rate: Array, once: Array, twice: Array, p_out: Array, v_out: Array) -> None:
+    """Add to position and velocity what gravity does in a time while n turns at a rate."""
     once[0], once[1], once[2] = rate[1] * g, -rate[0] * g, 0.0
     cross(rate, once, twice)
     square = t * t * dot(rate, rate)
@@ -401,7 +437,7 @@ def _predict(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> No
     rate, far, fast, along, twice = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     for i in range(3):
         rate[i] = row[EARTH_RATE + i]
-    _gravity(row, rate, along, twice, p_out, v_out)
+    _gravity(t, row[GRAVITY], rate, along, twice, p_out, v_out)
     cross(rate, p, along)
     for i in range(3):
         fast[i] = v_out[i] + along[i]
@@ -417,6 +453,117 @@ def _predict(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> No
         v_out[i] -= along[i]
 
 
+# of an interval in frame "earth": where its vectors lie in the scratch
+RATE_IN, RATE_IE, PULL, RUN, WAY, ASIDE, WORK, CHANGE = 0, 1, 2, 3, 4, 5, 6, 7
+
+
+@view_helper
+def _move_on_earth(row: Array, v: Array, vectors: Array, u_out: Array) -> None:
+    """Velocity u, and the way d in `WAY`, by a velocity before and by P and V in `PULL` and `RUN`; linear in these."""
+    t, P, V, way, aside, work = row[DURATION], vectors[PULL], vectors[RUN], vectors[WAY], vectors[ASIDE], vectors[WORK]
+    for i in range(3):
+        aside[i] = t * (0.5 * t * v[i] + P[i] / 3.0)
+        way[i] = t * v[i] + P[i]
+    cross(vectors[RATE_IE], aside, work)
+    for i in range(3):
+        way[i] -= work[i]
+        aside[i] += t * P[i] / 3.0
+    cross(vectors[RATE_IE], way, work)
+    for i in range(3):
+        u_out[i] = v[i] + V[i] - work[i]
+    cross(vectors[RATE_IN], aside, work)
+    for i in range(3):
+        way[i] -= work[i]
+
+
+@view_helper
+def _predict_on_earth(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> tuple[float, float]:
+    """`_predict` in frame "earth"; the scales of north and east in the middle of the way."""
+    R, p, v, t, zeta, vectors = state.R, state.p, state.v, row[DURATION], scratch.zeta, scratch.vectors
+    rate, w_ie, P, V = vectors[RATE_IN], vectors[RATE_IE], vectors[PULL], vectors[RUN]
+    way, work, u = vectors[WAY], vectors[WORK], vectors[CHANGE]
+    latitude = latitude_at(row[LATITUDE], p[0])
+    M, N = radii(latitude)
+    gravity = row[GRAVITY] + normal_gravity(latitude) - normal_gravity(row[LATITUDE]) + GRAVITY_PER_DEPTH * p[2]
+    exp_rotation(zeta, scratch.turn)
+    for i in range(3):
+        P[i] = R[i, 0] * zeta[3] + R[i, 1] * zeta[4] + R[i, 2] * zeta[5]
+        V[i] = R[i, 0] * zeta[6] + R[i, 1] * zeta[7] + R[i, 2] * zeta[8]
+    w_ie[0], w_ie[1], w_ie[2] = OMEGA * math.cos(latitude), 0.0, -OMEGA * math.sin(latitude)
+    by_north, by_east = (v[0] + 0.5 * V[0]) / (M - p[2]), (v[1] + 0.5 * V[1]) / (N - p[2])
+    rate[0], rate[1], rate[2] = w_ie[0] + by_east, -by_north, w_ie[2] - by_east * math.tan(latitude)
+    _gravity(t, gravity, rate, vectors[ASIDE], work, P, V)
+    _move_on_earth(row, v, vectors, u)
+    for i in range(3):
+        work[i] = -t * rate[i]
+    exp_rotation(work, scratch.E)
+    rotate(scratch.E, u, out.v)
+    multiply(R, scratch.turn, scratch.ER)
+    multiply(scratch.E, scratch.ER, out.R)
+    k_north, k_east = scales(row[LATITUDE], latitude + 0.5 * way[0] / M, p[2] + 0.5 * way[2])
+    out.p[0], out.p[1], out.p[2] = p[0] + k_north * way[0], p[1] + k_east * way[1], p[2] + way[2]
+    return k_north, k_east
+
+
+@view_helper
+def _predict_on_earth_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
+    """`predict_with_jacobian` in frame "earth", corrected for the bias.
+
+    A change of the state changes the way, and with it the transport rate. What a change of latitude does to rates and
+    radii in one interval is left out, but for the scale of east.
+    """
+    zeta, t, J, R, Jr, vectors = scratch.zeta, row[DURATION], scratch.J, state.R, scratch.matrices[0], scratch.vectors
+    k_north, k_east = _predict_on_earth(row, state, out, scratch)
+    latitude = latitude_at(row[LATITUDE], state.p[0])
+    M, N = radii(latitude)
+    tangent = math.tan(latitude)
+    east_by_latitude, latitude_by_north = k_east * vectors[WAY, 1] * tangent / N, M / radii(row[LATITUDE])[0]
+    P, V, way, change = vectors[PULL], vectors[RUN], vectors[WAY], vectors[CHANGE]
+    v, work = scratch.matrices[1, 0], scratch.matrices[1, 1]
+    right_jacobian(zeta, Jr)
+    for j in range(15):
+        for i in range(3):
+            J[i, j] = v[i] = P[i] = V[i] = 0.0
+        if j < 3:
+            a, b = (j + 1) % 3, (j + 2) % 3
+            for i in range(3):  # of -R S(zeta)
+                J[i, j] = scratch.turn[j, i]
+                P[i] = R[i, b] * zeta[3 + a] - R[i, a] * zeta[3 + b]
+                V[i] = R[i, b] * zeta[6 + a] - R[i, a] * zeta[6 + b]
+        elif j < 6:
+            V[2] = t * GRAVITY_PER_DEPTH * R[2, j - 3]
+            P[2] = 0.5 * t * V[2]
+        elif j < 9:
+            v[j - 6] = 1.0
+        else:
+            at = BY_BIAS + j - 9
+            for i in range(3):
+                J[i, j] = Jr[i, 0] * row[at] + Jr[i, 1] * row[at + 6] + Jr[i, 2] * row[at + 12]
+                P[i] = R[i, 0] * row[at + 18] + R[i, 1] * row[at + 24] + R[i, 2] * row[at + 30]
+                V[i] = R[i, 0] * row[at + 36] + R[i, 1] * row[at + 42] + R[i, 2] * row[at + 48]
+        by_north, by_east = t * (v[0] + 0.5 * V[0]) / M, t * (v[1] + 0.5 * V[1]) / N
+        change[0], change[1], change[2] = by_east, -by_north, -by_east * tangent  # of t w_en
+        fall = 0.5 * t * row[GRAVITY]
+        V[0] -= fall * by_north
+        V[1] -= fall * by_east
+        P[0] -= t / 3.0 * fall * by_north
+        P[1] -= t / 3.0 * fall * by_east
+        _move_on_earth(row, v, vectors, work)
+        rotate(scratch.E, work, v)
+        cross(out.v, change, work)
+        for i in range(3):
+            J[3 + i, j], J[6 + i, j] = way[i], v[i] + work[i]
+        rotate_back(out.R, change, work)
+        for i in range(3):
+            J[i, j] -= work[i]
+        J[3, j] *= k_north
+        J[4, j] = k_east * way[1] + 0.5 * east_by_latitude * way[0]
+        if 3 <= j < 6:
+            J[4, j] += east_by_latitude * latitude_by_north * R[0, j - 3]
+            for i in range(3):
+                J[3 + i, j] += R[i, j - 3]
+
+
 @view_helper
 def predict_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
     """The state after an interval, and how it depends on that before it.
@@ -426,6 +573,9 @@ def predict_with_jacobian(row: Array, state: Epoch, out: Epoch, scratch: MotionS
     zeta, t, turn, Jr = scratch.zeta, row[DURATION], scratch.turn, scratch.matrices[0]
     E, ER, J_out = scratch.E, scratch.ER, scratch.J
     correct_motion(row, state.b, zeta)
+    if _is_on_earth(row):
+        _predict_on_earth_with_jacobian(row, state, out, scratch)
+        return
     _predict(row, state, out, scratch)
     multiply(E, state.R, ER)
     right_jacobian(zeta, Jr)
@@ -471,7 +621,10 @@ def _add_turning(row: Array, R: Array, scratch: MotionScratch) -> None:
 def predict_motion(row: Array, state: Epoch, out: Epoch, scratch: MotionScratch) -> None:
     """The state at the end of one interval that is not coasted through, without derivatives."""
     correct_motion(row, state.b, scratch.zeta)
-    _predict(row, state, out, scratch)
+    if _is_on_earth(row):
+        _predict_on_earth(row, state, out, scratch)
+    else:
+        _predict(row, state, out, scratch)
 
 
 @helper
@@ -486,11 +639,11 @@ def predict_with_transition(
     """
     if is_cruising(row):
         cruise(row, state, out)
-        cruising_transition(row, state.R, state.v, F_out, Q_out)
+        cruising_transition(row, state, F_out, Q_out)
         return
     if is_coasted(row):
         coast(row, state, out)
-        coasting_transition(row, state.R, out.R, F_out, Q_out)
+        coasting_transition(row, state, out.R, F_out, Q_out)
         return
     scratch = make_motion_scratch()
     J, R_out = scratch.J, out.R

@@ -8,6 +8,7 @@
 `NOISE`              5  densities of accelerometer, gyro, their biases' walks, and of the integration [SI/rtHz]
 `GRAVITY`            1  [m/s^2]
 `EARTH_RATE`         3  of the Earth in n, zeros where n is taken as inertial [rad/s]
+`LATITUDE`           1  of the origin of frame "earth" (`rovgraph.kernels.earth`) [rad]; NaN = n is flat
 `BY_BIAS`           54  derivative of zeta by the bias, shape (9, 6)
 ===============  =====  ========================================================================================
 
@@ -20,7 +21,7 @@ the residual in column `RESIDUAL`, columns of the state after it from `AFTER` on
 
 import numpy as np
 
-DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, ROW = 0, 1, 2, 11, 17, 22, 23, 26, 80
+DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, LATITUDE, BY_BIAS, ROW = 0, 1, 2, 11, 17, 22, 23, 26, 27, 81
 VELOCITY = slice(TANGENT + 6, TANGENT + 9)
 NO_IMU = np.inf  # instead of a gap
 

@@ -265,6 +265,10 @@ class Startup:
     _next: float | None = None
 
     def __post_init__(self) -> None:
+        if self.config.environment.frame == "earth":
+            raise InputError(
+                "environment.frame: earth is for recorded logs; state flat, and smooth the recording in it"
+            )
         if has_constant_velocity(self.config):
             raise InputError(f"motion.model: constant_velocity is for recorded logs, {NEEDS_IMU}")
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-import pymap3d
 from numpy.typing import NDArray
 
 from rovgraph import compatibility
@@ -44,6 +43,8 @@ from rovgraph.log.units import (
     turn_angles,
 )
 from rovgraph.model.config import Config, TableSettings
+from rovgraph.model.config_sections import Environment
+from rovgraph.model.origin import EarthOrigin, north_east, origin_in
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
@@ -181,7 +182,7 @@ def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, St
     cells, _ = read_columns(table, config.table)
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
     cells, line = in_order(cells, table.line, table.source, RECEIVED in table.names)
-    origin = _add_local_fixes(cells, line, table.source, origin)
+    origin = _add_local_fixes(cells, line, table.source, origin, config.environment)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
     streams += [_thruster(cells, line, table.source)]
@@ -349,7 +350,7 @@ def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool
 
 
 def _add_local_fixes(
-    cells: dict[str, Array], line: Lines, source: str, origin: tuple[float, float] | None
+    cells: dict[str, Array], line: Lines, source: str, origin: Origin, environment: Environment
 ) -> tuple[float, float] | None:
     """Turn latitude and longitude of fixes and of the ship into north and east.
 
@@ -373,12 +374,14 @@ def _add_local_fixes(
         cells[local[0]], cells[local[1]] = lat * np.nan, lon * np.nan
         if not valid.size:
             continue
-        origin = (float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
-        north, east, _ = pymap3d.geodetic2ned(lat[valid], lon[valid], 0.0, *origin, 0.0)
-        if (away := float(np.median(np.hypot(north, east)))) > FARTHEST:
+        origin = origin_in(environment.frame, float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
+        north, east = north_east(lat[valid], lon[valid], origin)
+        away = float(np.median(np.hypot(north, east)))
+        if away > FARTHEST and not isinstance(origin, EarthOrigin):
             raise InputError(
                 f"{source}: {what} lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
-                f"{origin[0]:g}, {origin[1]:g}; correct them, or remove these keys to use the first fix"
+                f"{origin[0]:g}, {origin[1]:g}; correct them, remove these keys to use the first fix, "
+                "or state environment.frame: earth"
             )
         cells[local[0]][valid], cells[local[1]][valid] = north, east
     return origin

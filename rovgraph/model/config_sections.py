@@ -10,8 +10,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
-from rovgraph.geometry import normal_gravity
+from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, normal_gravity
 from rovgraph.model.calibration import LAYERS
+from rovgraph.model.origin import origin_in
 from rovgraph.model.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
@@ -20,6 +21,8 @@ Readmission = Annotated[
     Field(gt=0, description="after this long a rejected sensor is used again; a filter first inflates its covariance"),
 ]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
+HIGHEST_LATITUDE_DEG = 85.0  # of an origin in frame "earth"
+SAME_LATITUDE_DEG = 0.1  # by which two statements of it may differ
 NotNegative = Annotated[float, Field(ge=0)]
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
@@ -84,6 +87,10 @@ class Environment(ConfigSection):
     latitude_deg: Latitude | None = Field(
         None, description="latitude, for gravity and Earth rotation; null = of the origin"
     )
+    frame: Literal["flat", "earth"] = Field(
+        "flat",
+        description="north and east on a plane, or as latitude and longitude on WGS 84 at the origin's scale (earth)",
+    )
     declination_deg: float = Field(
         0.0,
         description="magnetic declination, east positive; not given = by place and date for a magnetometer that is the "
@@ -103,11 +110,33 @@ class Environment(ConfigSection):
             raise PydanticCustomError("half", "expected both origin_lat_deg and origin_lon_deg, or neither")
         return self
 
+    @model_validator(mode="after")
+    def _whole_earth(self) -> Self:
+        if self.frame != "earth":
+            return self
+        latitude, origin = self.latitude_deg, self.origin_lat_deg
+        if latitude is not None and origin is not None and abs(latitude - origin) > SAME_LATITUDE_DEG:
+            text = "frame: earth takes the latitude of the origin, {o} deg; remove latitude_deg = {l}, or correct it"
+            raise PydanticCustomError("two", text, {"o": f"{origin:g}", "l": f"{latitude:g}"})
+        for stated in (latitude, origin):
+            if stated is not None and abs(stated) > HIGHEST_LATITUDE_DEG:
+                text = "frame: earth reaches to latitude {h} deg, and {l} is beyond; state frame: flat"
+                raise PydanticCustomError("pole", text, {"h": f"{HIGHEST_LATITUDE_DEG:g}", "l": f"{stated:g}"})
+        return self
+
     @property
     def origin(self) -> tuple[float, float] | None:
         """Latitude and longitude [deg] of north = east = 0, where they are stated."""
         lat, lon = self.origin_lat_deg, self.origin_lon_deg
-        return None if lat is None or lon is None else (lat, lon)
+        return None if lat is None or lon is None else origin_in(self.frame, lat, lon)
+
+    @property
+    def earth_latitude(self) -> float:
+        """Latitude of the origin of frame "earth" [rad]; NaN in a flat one."""
+        if self.frame != "earth":
+            return np.nan
+        lat = self.latitude_deg if self.origin_lat_deg is None else self.origin_lat_deg
+        return np.nan if lat is None else float(np.deg2rad(lat))
 
     @property
     def latitude(self) -> float | None:
@@ -123,7 +152,7 @@ class Environment(ConfigSection):
         """Gravity [m/s^2] at depths [m], shape of these: one that is stated holds at all of them."""
         if self.gravity_mps2 is not None or self.latitude is None:
             return np.broadcast_to(UNKNOWN_GRAVITY if self.gravity_mps2 is None else self.gravity_mps2, np.shape(depth))
-        return normal_gravity(np.deg2rad(self.latitude), depth)
+        return normal_gravity(np.deg2rad(self.latitude)) + GRAVITY_PER_DEPTH * np.asarray(depth)
 
 
 UNKNOWN_GRAVITY = 9.81  # where no latitude is known [m/s^2]

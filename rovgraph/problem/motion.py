@@ -69,30 +69,32 @@ class PreintegrationParams:
     densities : noise of accelerometer, gyro, their biases' walks and the integration [SI/rtHz]
     gravity : [m/s^2]
     earth_rate_n : of the Earth, zeros where n is taken as inertial [rad/s]
+    latitude : of the origin of frame "earth" [rad]; NaN = n is flat
     """
 
     densities: Sequence[float]
     gravity: float
     earth_rate_n: Sequence[float] | Array
+    latitude: float = np.nan
 
     def row(self, bias: Array, gap_s: float) -> Array:
         """The row of a motion that is yet to be integrated."""
         row = np.zeros(at.ROW)
         row[at.NOISE : at.NOISE + 5], row[at.GRAVITY] = self.densities, self.gravity
-        row[at.EARTH_RATE : at.EARTH_RATE + 3] = self.earth_rate_n
+        row[at.EARTH_RATE : at.EARTH_RATE + 3], row[at.LATITUDE] = self.earth_rate_n, self.latitude
         row[at.BIAS : at.BIAS + 6], row[at.GAP] = bias, gap_s
         return row
 
 
 def preintegration_params(config: Config) -> PreintegrationParams:
     """Parameters of a configuration; without an IMU those of a motion without gravity, whose biases stay."""
+    noise, env, motion = config.imu.noise, config.environment, config.motion
     if has_constant_velocity(config):
-        motion = config.motion
-        return PreintegrationParams((motion.acc, motion.gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD), 0.0, np.zeros(3))
-    noise, env = config.imu.noise, config.environment
+        densities = (motion.acc, motion.gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD)
+        return PreintegrationParams(densities, 0.0, np.zeros(3), env.earth_latitude)
     rate = earth_rate_n(np.deg2rad(env.latitude_deg or 0.0)) if env.earth_rotation else np.zeros(3)
     densities = (noise.acc, noise.gyr, noise.acc_walk, noise.gyr_walk, INTEGRATION_SD)
-    return PreintegrationParams(densities, env.gravity, rate)
+    return PreintegrationParams(densities, env.gravity, rate, env.earth_latitude)
 
 
 def scatter(time: Array, samples: Array) -> Array:

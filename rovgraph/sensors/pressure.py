@@ -2,7 +2,7 @@
 
     depth = x / (1 + k x / 2 g),  x = (pressure - surface) / (density g)
 
-where g is gravity at the surface and k its growth with depth (`rovgraph.geometry.BY_DEPTH`); the density is constant.
+where g is gravity at the surface and k its growth with depth (`rovgraph.kernels.earth`); the density is constant.
 Reading a log and the online mode take pressures one by one through the same `DepthByPressure`, so their depths agree.
 """
 
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import BY_DEPTH, Array, normal_gravity
+from rovgraph.geometry import Array
+from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, normal_gravity
 from rovgraph.model.config import Config
 from rovgraph.sensors.sensor import Column, Sensor
 
@@ -131,7 +132,7 @@ class DepthByPressure:
         surface = np.where(np.isnan(surface), STANDARD, surface)
         x = (pascal - surface) / (self._density * gravity)
         possible = np.isfinite(pascal) & (pascal >= np.minimum(surface - GAUGE_PA, LEAST))
-        return np.where(possible, x / (1.0 + (BY_DEPTH if normal else 0.0) * x / (2.0 * gravity)), np.nan)
+        return np.where(possible, x / (1.0 + (GRAVITY_PER_DEPTH if normal else 0.0) * x / (2.0 * gravity)), np.nan)
 
     def says(self, surface: Array) -> str:
         """What the depths rest on, by the pressures of the surface, shape (n,)."""

@@ -49,6 +49,8 @@ def _earth_rate(config: Config) -> Array:
     InputError : modelled, but the latitude is not known
     """
     env = config.environment
+    if env.frame == "earth":
+        raise InputError("dives are simulated in environment.frame: flat; state that")
     if not env.earth_rotation:
         return np.zeros(3)
     if env.latitude_deg is None:

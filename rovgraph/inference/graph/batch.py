@@ -156,8 +156,9 @@ def motion_factor(problem: Problem, k: int, unknowns: CalibrationRoles, index: i
 
     ``index`` is that of the value which calibration that walks has there.
     """
-    if problem.coasted[k]:
-        return custom_factor(problem, k, unknowns.fixed, {})
+    if problem.coasted[k] or not np.isnan(problem.motions[k - 1, at.LATITUDE]):
+        keys = {name: calibration_key(unknowns, name, index) for name in SCALES if name in unknowns.walks}
+        return custom_factor(problem, k, unknowns.fixed, {} if problem.coasted[k] or not len(problem.scales) else keys)
     if len(problem.scales):
         keys = {name: calibration_key(unknowns, name, index) for name in SCALES if name in unknowns.walks}
         return custom_factor(problem, k, unknowns.fixed, keys)
@@ -175,7 +176,7 @@ def preintegrated(motion: Array, steps: Array) -> gtsam.PreintegratedCombinedMea
     params.setBiasAccCovariance(np.eye(3) * acc_walk**2)
     params.setBiasOmegaCovariance(np.eye(3) * gyr_walk**2)
     params.setIntegrationCovariance(np.eye(3) * integration**2)
-    if (earth_rate_n := motion[at.EARTH_RATE : at.BY_BIAS]).any():
+    if (earth_rate_n := motion[at.EARTH_RATE : at.LATITUDE]).any():
         params.setOmegaCoriolis(earth_rate_n)
     bias = motion[at.BIAS : at.NOISE]
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))

@@ -15,6 +15,7 @@ from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.trajectory import Trajectory, read_trajectory
+from rovgraph.model.origin import lat_lon
 from rovgraph.report.folder import ACOUSTICS_FILE, SOUNDINGS_FILE, beacon_names_of
 
 CHI2_95 = 5.991  # of two degrees of freedom
@@ -93,9 +94,7 @@ class Track:
         ------
         InputError : as `lat_lon`
         """
-        from pymap3d import ned2geodetic
-
-        lat, lon, _ = ned2geodetic(north, east, 0.0, *require_place(self.name, self.origin), 0.0)
+        lat, lon = lat_lon(north, east, require_place(self.name, self.origin))
         return np.asarray(lat), np.asarray(lon)
 
     @property

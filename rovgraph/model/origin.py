@@ -1,0 +1,57 @@
+"""Where north = east = 0 lies, and what latitude and longitude are there in north and east.
+
+An origin is a pair of latitude and longitude [deg]. A plain pair is that of a flat frame, the plane that touches the
+ellipsoid there. An `EarthOrigin` is that of frame "earth" (`rovgraph.kernels.earth`), in which north and east are
+latitude and longitude at the scale of the origin: along a meridian and a parallel they are metres near it, and both
+ways are exact however far.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pymap3d
+from numpy.typing import ArrayLike
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.earth import radii
+
+
+class EarthOrigin(NamedTuple):
+    """Latitude and longitude [deg] of north = east = 0 in frame "earth"."""
+
+    lat: float
+    lon: float
+
+    @property
+    def metres_per_degree(self) -> tuple[float, float]:
+        """Of latitude to the north, and of longitude to the east."""
+        M, N = radii(np.deg2rad(self.lat))
+        return float(np.deg2rad(M)), float(np.deg2rad(N * np.cos(np.deg2rad(self.lat))))
+
+
+Origin = tuple[float, float] | EarthOrigin
+
+
+def origin_in(frame: Literal["flat", "earth"], lat: float, lon: float) -> Origin:
+    """An origin of a frame."""
+    return EarthOrigin(lat, lon) if frame == "earth" else (lat, lon)
+
+
+def north_east(lat: ArrayLike, lon: ArrayLike, origin: Origin) -> tuple[Array, Array]:
+    """North and east [m] of latitudes and longitudes [deg], n of each."""
+    if isinstance(origin, EarthOrigin):
+        of_lat, of_lon = origin.metres_per_degree
+        east = np.asarray(lon, float) - origin.lon
+        return (np.asarray(lat, float) - origin.lat) * of_lat, (east - 360.0 * np.round(east / 360.0)) * of_lon
+    north, east, _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+    return north, east
+
+
+def lat_lon(north: ArrayLike, east: ArrayLike, origin: Origin) -> tuple[Array, Array]:
+    """Latitude, and longitude from -180 to 180 [deg], of n places [m]."""
+    if isinstance(origin, EarthOrigin):
+        of_lat, of_lon = origin.metres_per_degree
+        lon = origin.lon + np.asarray(east, float) / of_lon
+        return origin.lat + np.asarray(north, float) / of_lat, lon - 360.0 * np.round(lon / 360.0)
+    lat, lon, _ = pymap3d.ned2geodetic(north, east, 0.0, *origin, 0.0)
+    return lat, lon
