@@ -631,7 +631,7 @@ def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str])
     return gravity
 
 
-def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, object]:
+def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, float]:
     """What frame "earth" sets: the Earth's rotation, and gravity at the origin where it is not stated.
 
     Raises
@@ -654,7 +654,7 @@ def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, obj
             "state environment.frame: flat, or leave these columns out"
         )
     if has_constant_velocity(config):
-        changes: dict[str, object] = {}
+        changes: dict[str, float] = {}
     elif "earth_rotation" in env.model_fields_set and not env.earth_rotation:
         raise InputError("environment.frame: earth turns with the Earth; remove environment.earth_rotation: false")
     else:

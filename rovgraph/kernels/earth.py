@@ -38,7 +38,8 @@ def radii(latitude: Number) -> tuple[Number, Number]:
 def normal_gravity(latitude: Number) -> Number:
     """Gravity on the ellipsoid at a latitude [rad], [m/s^2]."""
     square = np.sin(latitude) ** 2
-    return 9.7803253359 * (1.0 + 0.001931852652 * square) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * square)
+    gravity: Number = 9.7803253359 * (1.0 + 0.001931852652 * square) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * square)
+    return gravity
 
 
 @helper

@@ -152,7 +152,7 @@ class Environment(ConfigSection):
         """Gravity [m/s^2] at depths [m], shape of these: one that is stated holds at all of them."""
         if self.gravity_mps2 is not None or self.latitude is None:
             return np.broadcast_to(UNKNOWN_GRAVITY if self.gravity_mps2 is None else self.gravity_mps2, np.shape(depth))
-        return normal_gravity(np.deg2rad(self.latitude)) + GRAVITY_PER_DEPTH * np.asarray(depth)
+        return np.asarray(normal_gravity(np.deg2rad(self.latitude)) + GRAVITY_PER_DEPTH * np.asarray(depth))
 
 
 UNKNOWN_GRAVITY = 9.81  # where no latitude is known [m/s^2]

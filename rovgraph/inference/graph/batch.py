@@ -37,7 +37,7 @@ from rovgraph.inference.graph.values import (
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.motion_residual import motion_errors
 from rovgraph.kernels.states import States
-from rovgraph.model.calibration import TABLE, Belief
+from rovgraph.model.calibration import LAYERS, TABLE, Belief
 from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 from rovgraph.problem.calibration_roles import CalibrationRoles, unknowns
@@ -58,6 +58,14 @@ from rovgraph.sensors.instruments import Instrument
 
 Factor = gtsam.NonlinearFactor
 ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
+
+
+def refuse_layers(unknowns: CalibrationRoles) -> None:
+    """Raise InputError where the current has layers: a new knot would not follow from its neighbour here."""
+    if LAYERS[0] in unknowns.estimated:
+        raise InputError(
+            "GTSAM and iSAM2 do not take profiles of the water; state water.use: false, or leave these estimators out"
+        )
 
 
 def priors(prior: StatePrior, beliefs: Mapping[str, Belief], unknowns: CalibrationRoles) -> list[Factor]:
@@ -411,6 +419,7 @@ def make_graph(
     """
     index = np.arange(len(problem))
     wanted = wanted or unknowns(beliefs, problem.used)
+    refuse_layers(wanted)
     factors = _others(problem, prior, beliefs, wanted, index)
     blocks = measurements_of(problem, instruments, instruments, gravity(config), wanted)
     if "place" in blocks:

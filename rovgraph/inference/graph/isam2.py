@@ -42,7 +42,7 @@ from rovgraph.inference.faulty_intervals import Searches
 from rovgraph.inference.filter import ORIGIN, FilterEngine
 from rovgraph.inference.filter_step import FilterGates, FilterStep, Gaussian, Met, states_of
 from rovgraph.inference.gauss_newton import Gates
-from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate
+from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate, refuse_layers
 from rovgraph.inference.graph.places import associated_optimum, resolved
 from rovgraph.inference.graph.values import CALIBRATION, key
 from rovgraph.inference.lever_arm_bias import with_arm_of_rates
@@ -144,6 +144,7 @@ class Linearization:
     """
 
     def __init__(self, filter: FilterEngine, prior: StatePrior) -> None:
+        refuse_layers(filter.unknowns)
         self._prior = prior
         self._prior_weight = np.linalg.inv(np.linalg.cholesky(prior.covariance()))
         self._size = filter.layout.size
