@@ -42,6 +42,6 @@ def test_simulated_accelerometers_feel_gravity_grow_with_depth() -> None:
     still = np.zeros((n, 3))
     motion = Motion(np.arange(2.0), np.tile(np.eye(3), (n, 1, 1)), down, still, still, still, still)
     config = Config().changed(environment={"latitude_deg": 45.0})
-    np.testing.assert_allclose(specific_force_and_rate(motion, config)[:, 2], [-9.8061978, -9.8084178], atol=1e-6)
+    np.testing.assert_allclose(specific_force_and_rate(motion, config)[:, 2], [-9.8061978, -9.8084138], atol=1e-6)
     stated = falcon(environment={"gravity_mps2": 9.81, "latitude_deg": 45.0})
     np.testing.assert_array_equal(specific_force_and_rate(motion, stated)[:, 2], [-9.81, -9.81])
