@@ -31,14 +31,14 @@ from rovgraph.inference.graph.batch import DiveGraph, indeterminate, make_graph,
 from rovgraph.inference.graph.optimum import covariances, marginals
 from rovgraph.inference.graph.values import key
 from rovgraph.log import Log
-from rovgraph.model.calibration import TABLE
+from rovgraph.model.calibration import LAYERS, TABLE
 from rovgraph.model.config import Config, beliefs
 from rovgraph.problem.measurements import loss_and_weight
 from rovgraph.simulate import CALM, Style, scenario
 
 DEG = np.deg2rad(1.0)
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "batch.py"
-HELD = {name: {"estimate": False} for name in TABLE}
+HELD = {name: {"estimate": False} for name in TABLE if name not in LAYERS}
 
 
 def problem_of(log, config) -> tuple[DiveGraph, gtsam.Values]:
@@ -249,7 +249,7 @@ def test_a_gate_of_null_lets_everything_in(noisy):
 def small():
     """A short graph with every sensor, at a point that is not its optimum."""
     config = falcon(
-        calibration={name: {"estimate": True} for name in TABLE},
+        calibration={name: {"estimate": True} for name in TABLE if name not in LAYERS},
         heading={"sources": ["mag", "dvl", "ahrs"]},
         start={"position_sd_m": 1.0},
     )

@@ -150,7 +150,7 @@ OTHERS = {"ahrs_time_offset": 0.1, "mag_time_offset": -0.08, "depth_time_offset"
 @cache
 def others_late(noise: bool) -> Simulated:
     """A dive whose stamps of compasses, depth and fixes are late, each by as much as `OTHERS` says."""
-    held = {name: {"estimate": name in ("ahrs_offset", "mag_offset")} for name in TABLE}
+    held = {name: {"estimate": name in ("ahrs_offset", "mag_offset")} for name in TABLE if name not in LAYERS}
     config = falcon(
         heading={"sources": ["ahrs", "mag"], "ahrs_sd_deg": 0.3, "mag_sd_deg": 0.3},
         calibration=held | {name: {"estimate": True} for name in OTHERS},

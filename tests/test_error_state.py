@@ -53,7 +53,7 @@ from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.motion_row import DURATION, ROW
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.log import Log
-from rovgraph.model.calibration import LAYOUT, TABLE, calibration_size
+from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, calibration_size
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.state import DIMENSION, VELOCITY, State
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
@@ -194,7 +194,8 @@ def engine_and_estimate(rng: np.random.Generator) -> tuple[FilterEngine, Gaussia
     """A filter that estimates all calibration, and an estimate with any covariance."""
     environment = {"field_norm": 48.0}
     names = [n for i in instruments(falcon(environment=environment)).values() for n in i.model.calibration]
-    estimated = {n: {"estimate": n in names} for n in {*names, *(n for n, v in TABLE.items() if v.considered)}}
+    stated = {*names, *(n for n, v in TABLE.items() if v.considered)} - {*LAYERS}
+    estimated = {n: {"estimate": n in names} for n in stated}
     config = falcon(calibration=estimated, environment=environment)
     calibration = {
         n: 0.05 * rng.standard_normal(TABLE[n].dim) if n in names else np.zeros(v.dim) for n, v in TABLE.items()
@@ -507,7 +508,7 @@ def told(case: Simulated, part: float) -> Config:
     for name, true in case.dive.hidden["calibration"].items():
         belief, angular = beliefs(case.config)[name], TABLE[name].angular
         tail, unit = ("_deg", 1.0 / DEG) if angular else ("", 1.0)
-        if belief.estimate or belief.considered:
+        if name not in LAYERS and (belief.estimate or belief.considered):
             calibration[name] = {"mean" + tail: (unit * true).tolist(), "sd" + tail: unit * part * belief.sd}
     start = case.config.start
     sd = {key: part * getattr(start, key) for key in ("heading_sd_deg", "tilt_sd_deg")}

@@ -266,7 +266,7 @@ def test_positions_are_in_the_unit_of_their_range(scale, unit, sureness, tmp_pat
         ("depth_m", "depth", "m"),
         ("Depth (meters)", "depth", "m"),
         ("depth [ft]", "", ""),
-        ("pressure [Pa]", "", ""),
+        ("pressure [Pa]", "pressure", "Pa"),
         ("gps.lat", "fix_lat", ""),
         ("lon_e7", "fix_lon", "degE7"),
         ("usbl_easting", "fix_east", ""),

@@ -8,7 +8,7 @@ import pytest
 
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate, transpose, wrap_angle
 from rovgraph.log.units import UNITS
-from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, TABLE
+from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
 from rovgraph.sensors import field_direction, innovation
@@ -25,8 +25,8 @@ environment: {declination_deg: 4.5, dip_deg: 72, field_norm: 0.5}
 """
 )
 ALL = instruments(CONFIG, CONFIG.imu.lever_arm_m)
-# those need a ship, or where their beam points: test_acoustics, test_dvl_beam_model
-SENSORS = {name: one for name, one in ALL.items() if name not in {*ACOUSTICS, *BEAM_SENSORS}}
+# those need a ship, where their beam points, or a layer: test_acoustics, test_dvl_beam_model, test_water_layers
+SENSORS = {name: one for name, one in ALL.items() if name not in {*ACOUSTICS, *BEAM_SENSORS, WATER_LAYER}}
 N, STEP = 6, 1e-6
 
 
@@ -76,8 +76,7 @@ def test_a_calibration_variable_that_is_named_has_an_influence(sensor):
     model, state = SENSORS[sensor].model, random_state()
     _, H = model.predict(state, np.ones((N, 3)))
     about_its_own_axis = {"dvl_roll"} if sensor == "dvl_heading" else set()  # a roll leaves the x axis where it is
-    of_other_layers = set(LAYERS[2:])  # one lies between two knots
-    for name in set(model.calibration) - about_its_own_axis - of_other_layers:
+    for name in set(model.calibration) - about_its_own_axis:
         assert np.abs(H[name]).max() > 1e-3
     assert set(H) <= {*model.state, *model.calibration}
 
@@ -276,7 +275,7 @@ def test_every_unit_has_the_factor_that_pint_has():
     registry = pint.UnitRegistry()
     inside = {
         "time": "second", "acceleration": "meter / second ** 2", "rate": "radian / second", "field": "microtesla",
-        "angle": "radian", "speed": "meter / second", "length": "meter", "latitude": "degree",
+        "angle": "radian", "speed": "meter / second", "length": "meter", "latitude": "degree", "pressure": "pascal",
     }  # fmt: skip
     named = {
         "g": "standard_gravity", "mg": "millistandard_gravity", "m/s2": "meter / second ** 2",

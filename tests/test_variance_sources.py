@@ -71,7 +71,7 @@ def test_a_long_loss_of_lock_limits_a_dive(tmp_path):
 
 
 def test_every_sensor_but_depth_belongs_to_a_cause():
-    vertical = {"depth", "dvl_altitude", "vehicle_tilt", "place"}
+    vertical = {"depth", "pressure", "dvl_altitude", "vehicle_tilt", "place"}
     for sensor in {*SENSORS} - vertical:
         assert any(sensor.startswith(cause.sources) for cause in CAUSES), sensor
 

@@ -48,7 +48,7 @@ from rovgraph.model.origin import EarthOrigin, north_east, origin_in
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
-from rovgraph.sensors.pressure import complaints, depths
+from rovgraph.sensors.pressure import PRESSURE, complaints, depths
 from rovgraph.sensors.water_layer import CELLS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
@@ -174,6 +174,8 @@ def water_at(time: Array, streams: Mapping[str, Stream]) -> WaterState:
 def delay_of(config: Config, sensor: str) -> float:
     """How much older a sensor's measurements are than their stamps [s]; beams and profiles of a DVL as it is."""
     delays: Mapping[str, float] = config.delay_s
+    if sensor == PRESSURE.name:
+        return delays.get("depth", 0.0)
     return delays.get(sensor, delays.get("dvl", 0.0) if sensor in (BEAMS, CELLS) else 0.0)
 
 

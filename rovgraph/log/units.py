@@ -34,7 +34,16 @@ UNITS: dict[str, dict[str, float]] = {
     "angle": _ANGLE,
     "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "length": _LENGTH,
-    "pressure": {"Pa": 1.0, "mbar": 1e2, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "dbar": 1e4, "psi": 6894.757},
+    "pressure": {
+        "Pa": 1.0,
+        "mbar": 1e2,
+        "hPa": 1e2,
+        "kPa": 1e3,
+        "MPa": 1e6,
+        "bar": 1e5,
+        "dbar": 1e4,
+        "psi": 6894.757293168,
+    },
     "latitude": {"deg": 1.0, "degE7": 1e-7, "rad": 1.0 / _DEG},
 }
 # kind of quantity -> units that no factor converts

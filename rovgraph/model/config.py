@@ -446,8 +446,9 @@ def beliefs(config: Config) -> dict[str, Belief]:
     mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
     mount |= dict(zip(USBL_MOUNT, config.usbl.mount_rpy_deg, strict=True))
     out = {}
-    for name in _ENTRIES:
-        variable = TABLE[name]
+    for name, variable in TABLE.items():
+        if name in LAYERS:
+            continue
         entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
         unit = float(np.deg2rad(1.0)) if variable.angular else 1.0
         mean = getattr(entry, "mean" + tail)
@@ -519,7 +520,7 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     names : calibration variables that are stated; None = all
     """
     given, entries = config.calibration, {}
-    for name in _ENTRIES if names is None else names:
+    for name in (name for name in TABLE if name not in LAYERS) if names is None else names:
         variable, entry = TABLE[name], getattr(given, name)
         key = "sd_deg" if variable.angular else "sd"
         if getattr(entry, key) is None or _sd_follows(name, config):

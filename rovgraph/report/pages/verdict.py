@@ -53,6 +53,11 @@ CAUSES = (
         "the acoustic positioning (noise, alignment, beacons)",
         "move beside the ship or round the beacon, so that the alignment shows, or state usbl and range more precisely",
     ),
+    Cause(
+        ("water_layer", "adcp"),
+        "the current, as profiles of the water show it",
+        "stay at the surface with fixes for some minutes before the dive, with the ADCP on",
+    ),
     Cause(("fix",), "the position fixes", "take better fixes, or state fix.sd_m where they are better", known=True),
     Cause(
         HEADING,
