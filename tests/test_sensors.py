@@ -53,12 +53,12 @@ def variables(model):
     return {**DIMENSION, **seen, **{name: TABLE[name].dim for name in model.calibration}}
 
 
-CASES = [(s, v) for s, instrument in SENSORS.items() for v in variables(instrument.model)]
+CASES = [(s, v) for s in (*SENSORS, WATER_LAYER) for v in variables(ALL[s].model)]
 
 
 @pytest.mark.parametrize(("sensor", "variable"), CASES, ids=lambda x: x)
 def test_derivative_is_the_finite_difference_of_the_prediction(sensor, variable):
-    model, state = SENSORS[sensor].model, random_state()
+    model, state = ALL[sensor].model, random_state()
     rate = np.random.default_rng(1).standard_normal((N, 3))
     _, H = model.predict(state, rate)
     dim = variables(model)[variable]

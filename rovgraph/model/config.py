@@ -446,9 +446,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
     mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
     mount |= dict(zip(USBL_MOUNT, config.usbl.mount_rpy_deg, strict=True))
     out = {}
-    for name, variable in TABLE.items():
-        if name in LAYERS:
-            continue
+    for name, variable in ((n, v) for n, v in TABLE.items() if n not in LAYERS):
         entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
         unit = float(np.deg2rad(1.0)) if variable.angular else 1.0
         mean = getattr(entry, "mean" + tail)
