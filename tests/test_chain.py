@@ -29,8 +29,9 @@ from rovgraph.simulate import simulated as driven
 from rovgraph.simulate.files import write_log
 
 EXACT = 1e-10  # decrease of the cost that is left when both stop here
-# these measure nothing of the vehicle, or where there is no IMU, or have a dive of their own
+# these measure nothing of the vehicle, or where there is no IMU, or have a dive or tests of their own
 UNUSED = "dvl_altitude", "vehicle_tilt", "ship", "ship_heading", "ship_tilt", "usbl", "range", "dvl_beams", "dvl_sound"
+UNUSED += "pressure", "adcp", "water_layer"
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0}
 WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
 

@@ -242,7 +242,7 @@ def test_the_manual_names_every_column_and_unit():
     from rovgraph.log.units import UNITS, groups
 
     manual = (DOCS / "log-format.md").read_text(encoding="utf-8")
-    of_others = re.compile(r"dvl_beam_\w+_[02-8]")  # of beams the manual names the first one's
+    of_others = re.compile(r"dvl_beam_\w+_[02-8]|adcp_beam_[02-8]")  # of beams the manual names the first one's
     columns = [name for name in all_columns() if not of_others.fullmatch(name)]
     columns = [name.removeprefix("adcp_") for name in columns]  # which a table beside the log has without it
     names = [*columns, *groups(), *(unit for known in UNITS.values() for unit in known)]
