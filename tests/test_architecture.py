@@ -223,7 +223,6 @@ def test_help_loads_nothing_heavy(command):
     assert sorted(loaded & HEAVY) == []
 
 
-@pytest.mark.slow
 def test_smoothing_a_log_of_a_healthy_dive_loads_no_library_that_it_does_not_need(tmp_path):
     log, config = (ROOT / "data" / "falcon" / name for name in ("log.csv.gz", "config.yaml"))
     arguments = ["smooth", str(log), "--config", str(config), "--out", str(tmp_path / "out"), "--no-figures"]

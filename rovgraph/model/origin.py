@@ -9,7 +9,6 @@ ways are exact however far.
 from typing import Literal, NamedTuple
 
 import numpy as np
-import pymap3d
 from numpy.typing import ArrayLike
 
 from rovgraph.geometry import Array
@@ -43,7 +42,9 @@ def north_east(lat: ArrayLike, lon: ArrayLike, origin: Origin) -> tuple[Array, A
         of_lat, of_lon = origin.metres_per_degree
         east = np.asarray(lon, float) - origin.lon
         return (np.asarray(lat, float) - origin.lat) * of_lat, (east - 360.0 * np.round(east / 360.0)) * of_lon
-    north, east, _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+    from pymap3d import geodetic2ned  # only logs with latitudes need it
+
+    north, east, _ = geodetic2ned(lat, lon, 0.0, *origin, 0.0)
     return north, east
 
 
@@ -53,5 +54,7 @@ def lat_lon(north: ArrayLike, east: ArrayLike, origin: Origin) -> tuple[Array, A
         of_lat, of_lon = origin.metres_per_degree
         lon = origin.lon + np.asarray(east, float) / of_lon
         return origin.lat + np.asarray(north, float) / of_lat, lon - 360.0 * np.round(lon / 360.0)
-    lat, lon, _ = pymap3d.ned2geodetic(north, east, 0.0, *origin, 0.0)
+    from pymap3d import ned2geodetic
+
+    lat, lon, _ = ned2geodetic(north, east, 0.0, *origin, 0.0)
     return lat, lon
