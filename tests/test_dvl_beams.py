@@ -12,7 +12,7 @@ from wire import report
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.log.beams import beams_of_table, usable_beams
+from rovgraph.log.companions import beams_of_table, usable_beams
 from rovgraph.log.tables import table_of_arrays
 from rovgraph.model.config import Config
 from rovgraph.readers.merging import merge

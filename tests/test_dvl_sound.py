@@ -10,7 +10,7 @@ import rovgraph as rg
 from rovgraph.live.intake import Intake
 from rovgraph.live.message import Reading
 from rovgraph.log import Log
-from rovgraph.log.beams import beams_of_table
+from rovgraph.log.companions import beams_of_table
 from rovgraph.log.tables import table_of_arrays
 from rovgraph.model.config import Config, beliefs, parse_config
 from rovgraph.sensors.dvl_beam import PHASED_C0, beam_geometry, beams_of, velocity_by_beams

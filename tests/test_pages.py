@@ -14,7 +14,7 @@ from browsers import PRINTS, printing_browser
 import rovgraph as rg
 from rovgraph.api.reporting import report
 from rovgraph.cli.app import main
-from rovgraph.log.beams import usable_beams
+from rovgraph.log.companions import usable_beams
 from rovgraph.model.config import Config
 from rovgraph.report.pages import printing
 from rovgraph.report.pages.page import Panel, Section, broken, extremes, line, packed, render

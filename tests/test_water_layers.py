@@ -14,7 +14,7 @@ from rovgraph.inference.smoother import assemble
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.log import Log, Stream
-from rovgraph.log.adcp import usable_cells
+from rovgraph.log.companions import usable_cells
 from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State

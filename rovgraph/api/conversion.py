@@ -13,7 +13,7 @@ from typing import Any
 
 from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
 from rovgraph.log import Log
-from rovgraph.log.beams import usable_beams
+from rovgraph.log.companions import usable_beams
 from rovgraph.log.tables import names_of, read_table, table_beside
 from rovgraph.log.units import groups, nearest, quantities
 from rovgraph.model.config import (

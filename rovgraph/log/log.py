@@ -10,8 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.errors import InputError, collected_warnings, warn
-from rovgraph.log.adcp import cells_beside
-from rovgraph.log.beams import beams_beside
+from rovgraph.log.companions import beams_beside, cells_beside
 from rovgraph.log.reading import read_streams, with_sound_speed
 from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
@@ -166,7 +165,7 @@ class Log:
 
         Parameters
         ----------
-        beams : of `rovgraph.log.beams`, by the log's clock, as the DVL gave them; None = not known
+        beams : of `rovgraph.log.companions`, by the log's clock, as the DVL gave them; None = not known
 
         Warns
         -----
@@ -185,7 +184,7 @@ class Log:
 
         Parameters
         ----------
-        cells : of `rovgraph.log.adcp`, by the log's clock; None = not known
+        cells : of `rovgraph.log.companions`, by the log's clock; None = not known
 
         Warns
         -----

@@ -12,7 +12,7 @@ import numpy as np
 
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
-from rovgraph.log.beams import beams_beside, beams_frame
+from rovgraph.log.companions import beams_beside, beams_frame
 from rovgraph.log.reading import in_order, numbers, read_columns
 from rovgraph.log.stamps import UNIX_S
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_COLUMN, is_column

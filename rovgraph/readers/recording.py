@@ -152,7 +152,7 @@ class Recording:
     warnings : what looks wrong, a sentence each
     tables : other tables that are worth keeping (name -> column -> ndarray, shape (n,)), with a column ``time`` [s] by
         the clock of the DVL's channels, or of the first channel without one. ``dvl_beams`` has what each beam
-        of the DVL measured, its columns as `rovgraph.log.beams` names them
+        of the DVL measured, its columns as `rovgraph.log.companions` names them
     pieces : the files that it was joined of, in the order of time; () = it is one file
     assumed : section of ``settings`` that is assumed -> its sentence in ``warnings``
     """

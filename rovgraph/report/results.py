@@ -23,7 +23,7 @@ from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
-from rovgraph.log.beams import beams_frame
+from rovgraph.log.companions import beams_frame
 from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown

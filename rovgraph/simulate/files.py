@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.log.beams import PREFIX
+from rovgraph.log.companions import PREFIX
 from rovgraph.log.tables import table_beside
 from rovgraph.model.config import Config, with_priors_stated
 from rovgraph.sensors import SENSORS

@@ -22,7 +22,7 @@ from rovgraph._version import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
-from rovgraph.log.beams import beams_of_table
+from rovgraph.log.companions import beams_of_table
 from rovgraph.log.tables import read_table
 from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import config_or_defaults
