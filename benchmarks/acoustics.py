@@ -9,7 +9,6 @@ command line. Each dive draws its constants from the priors that its configurati
 row's name says.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,12 +19,12 @@ import pandas as pd
 from fault_campaign.acoustic import Acoustic, Ship, System, heard_by_receivers, ranges, usbl
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import Streams, sample
-from fault_campaign.judge import Dive, Result, estimate_cells, run_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, row_options, run_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
 
-from rovgraph.lab.executors import cores, starting, workers
+from rovgraph.lab.executors import starting, workers
 
 AIDS = ("ahrs", "depth")
 CREW = {  # what a crew that has calibrated its system states
@@ -348,13 +347,7 @@ def figures(name: str, results: Sequence[Result]) -> str:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="ROW")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
-    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
-    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    parser = row_options(__doc__, ROWS)
     arguments = parser.parse_args()
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     print("| dive | " + " | ".join(heads) + " | verdicts | constants off (sd) |")

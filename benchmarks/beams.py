@@ -9,7 +9,6 @@ smoothed, filtered and online estimates. Dives go through the command line. A ro
 noise, such as one with beams lost and one with all.
 """
 
-import argparse
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,12 +21,12 @@ import pandas as pd
 from fault_campaign.beams import Beams, Bottom, Fault, Head, bias, lose, refuse, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, estimate_cells, run_command, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, row_options, run_command, run_dive, write_dive
 from fault_campaign.motion import Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
 
-from rovgraph.lab.executors import cores, starting, workers
+from rovgraph.lab.executors import starting, workers
 
 SCALE_SD = 0.003
 FIXES_END, SPEED_FROM = 800.0, 820.0  # of the row with fixes: until when it has them, from when speed is compared [s]
@@ -339,13 +338,7 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", choices=[*ROWS, "cost"], default=[*ROWS, "cost"], metavar="ROW")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
-    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
-    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    parser = row_options(__doc__, [*ROWS, "cost"])
     parser.add_argument("--figure", type=Path, help="draw what losing two beams costs, instead of the table")
     arguments = parser.parse_args()
     if arguments.figure:

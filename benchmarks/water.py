@@ -8,7 +8,6 @@ NEES of the smoothed, filtered and online estimates. A dive lies at the surface 
 on for 30 m with bottom lock. The error of a filter at the bottom is that before lock.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,12 +17,12 @@ import numpy as np
 import pandas as pd
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, estimate_cells, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, row_options, run_dive, write_dive
 from fault_campaign.motion import Motion, Profile, mounting
 from fault_campaign.vehicle import Dvl, configuration, make_vehicle
 from fault_campaign.water import Current, Profiler, draw, profiles
 
-from rovgraph.lab.executors import cores, starting, workers
+from rovgraph.lab.executors import starting, workers
 
 LOCK_M = 30.0  # of bottom track at the end
 TILT_SD = 0.2  # of the head's roll and pitch in the vehicle [deg]
@@ -168,13 +167,7 @@ def cost(rounds: int) -> tuple[float, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", choices=[*ROWS, "cost"], default=[*ROWS, "cost"], metavar="ROW")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=cores())
-    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
-    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
-    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    parser = row_options(__doc__, [*ROWS, "cost"])
     arguments = parser.parse_args()
     rows = [name for name in arguments.rows if name != "cost"]
     if "cost" in arguments.rows:

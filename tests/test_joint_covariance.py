@@ -94,6 +94,17 @@ def test_its_velocity_is_the_tracks_but_for_how_attitude_and_bias_turn_the_veloc
     assert turning > 0.1
 
 
+def test_north_and_east_alone_are_those_of_the_whole():
+    case = simulated(falcon(imu={"lever_arm_m": [0.0, 0.0, 0.0]}, **CONSIDERED), 40.0, seed=3, imu_rate=50.0)
+    posterior = smoothed(case.log, started(case)).posterior
+    keyframes = [3, 40, 90]
+    P, R_nb = posterior.at(posterior.optimum.problem.time[keyframes])
+    level = np.zeros((6, 45))
+    for k, R in enumerate(R_nb):
+        level[2 * k : 2 * k + 2, 15 * k + 3 : 15 * k + 6] = R[:2]
+    np.testing.assert_allclose(posterior.horizontal(keyframes), level @ P @ level.T, rtol=1e-6, atol=1e-12)
+
+
 def test_axes_of_the_body_are_those_of_the_contract(dive):
     time, R = dive.trajectory.time[50], dive.trajectory.R_nb[50]
     b, n = (dive.covariance(time, axes).to_numpy() for axes in "bn")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
 from rovgraph.inference.initialise import initialise
@@ -19,6 +20,7 @@ from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
+from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.layers import WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
 from rovgraph.sensors.dvl import DvlVelocity
 from rovgraph.sensors.dvl_beam import beam_geometry
@@ -190,6 +192,17 @@ def descent() -> tuple[Log, Config]:
     config = Config.model_validate(dive.configuration)
     log = Log.from_frame(log_table(dive.streams), config)
     return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
+
+
+def test_gtsam_and_isam2_refuse_layers_in_one_line(descent):
+    pytest.importorskip("gtsam")
+    from rovgraph.inference.graph.batch import refuse_layers
+
+    log, config = descent
+    initial = initialise(log, config)
+    roles = unknowns(initial.beliefs, assemble(log, initial).problem.used)
+    with pytest.raises(InputError, match=r"profiles of the water; state water\.use: false"):
+        refuse_layers(roles)
 
 
 @pytest.mark.slow

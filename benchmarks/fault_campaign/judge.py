@@ -4,13 +4,14 @@ NEES: the squared error over the variance per degree of freedom, its mean over e
 10 s after the start. 1 is honest.
 """
 
+import argparse
 import contextlib
 import io
 import json
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -23,6 +24,7 @@ from scipy.stats import chi2
 from fault_campaign.earth import Array
 from fault_campaign.instruments import Hidden, log_table
 from fault_campaign.motion import Motion
+from rovgraph.lab.executors import cores
 
 HONEST_NEES = 2.0
 LIE_NEES = 4.5  # of a dive that must not be trusted: a position is 3 of its stated sds off
@@ -351,6 +353,19 @@ class Outcome:
         """The quantity and estimate of the largest NEES; not a number where every dive was refused."""
         found = [(f"{q}, {kind}", v) for kind, values in self.nees.items() for q, v in values.items()]
         return max(found, key=lambda entry: entry[1], default=("", float("nan")))
+
+
+def row_options(doc: str | None, rows: Iterable[str]) -> argparse.ArgumentParser:
+    """Options of a benchmark that prints a row for some dives each."""
+    names = list(rows)
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="+", choices=names, default=names, metavar="ROW")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=cores())
+    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
+    parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
+    parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
+    return parser
 
 
 def estimate_cells(results: Sequence[Result]) -> list[str]:

@@ -213,7 +213,7 @@ class Posterior:
         return P[np.ix_(rows, rows)], R_nb[which.reshape(-1)]
 
     def horizontal(self, keyframes: Sequence[int]) -> Array:
-        """Joint covariance of north and east of m keyframes, increasing, shape (2 m, 2 m) [m^2]."""
+        """Joint covariance of the IMU's north and east at m keyframes, increasing, shape (2 m, 2 m) [m^2]."""
         known, R_nb = self._marginals(), self.optimum.state.R_nb
         H, X, gains = known._at(keyframes)
         m, rows = len(keyframes), R_nb[np.asarray(keyframes), :2]
