@@ -151,8 +151,8 @@ def below_ship(setting: Setting, seed: int) -> Dive:
     streams |= {"usbl": replies} | ship.says(setting.seconds, rng)
     others = {
         "usbl_yaw": lever[2] - ship.heading_error,
-        "usbl_time_offset": setting.latency,
-        "sound_speed_scale": np.nan if setting.profile else system.sound_speed / system.believed_speed - 1.0,
+        "usbl_time_offset": setting.latency or np.nan,
+        "sound_speed_scale": np.nan if setting.profile else system.believed_speed / system.sound_speed - 1.0,
     }
     return Dive(streams, merge(config, setting.config), motion, replace(hidden, others=others))
 
