@@ -24,7 +24,7 @@ from fault_campaign.motion import Motion, Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
 
-from rovgraph.lab.executors import starting, workers
+from rovgraph.lab.executors import cores, starting, workers
 
 AIDS = ("ahrs", "depth")
 CREW = {  # what a crew that has calibrated its system states
@@ -347,7 +347,7 @@ def figures(name: str, results: Sequence[Result]) -> str:
 
 def main() -> None:
     """Run and print."""
-    parser = row_options(__doc__, ROWS)
+    parser = row_options(__doc__, ROWS, cores())
     arguments = parser.parse_args()
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     print("| dive | " + " | ".join(heads) + " | verdicts | constants off (sd) |")

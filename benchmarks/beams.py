@@ -26,7 +26,7 @@ from fault_campaign.motion import Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
 
-from rovgraph.lab.executors import starting, workers
+from rovgraph.lab.executors import cores, starting, workers
 
 SCALE_SD = 0.003
 FIXES_END, SPEED_FROM = 800.0, 820.0  # of the row with fixes: until when it has them, from when speed is compared [s]
@@ -338,7 +338,7 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     """Run and print."""
-    parser = row_options(__doc__, [*ROWS, "cost"])
+    parser = row_options(__doc__, [*ROWS, "cost"], cores())
     parser.add_argument("--figure", type=Path, help="draw what losing two beams costs, instead of the table")
     arguments = parser.parse_args()
     if arguments.figure:

@@ -22,7 +22,7 @@ from fault_campaign.motion import Motion, Profile, mounting
 from fault_campaign.vehicle import Dvl, configuration, make_vehicle
 from fault_campaign.water import Current, Profiler, draw, profiles
 
-from rovgraph.lab.executors import starting, workers
+from rovgraph.lab.executors import cores, starting, workers
 
 LOCK_M = 30.0  # of bottom track at the end
 TILT_SD = 0.2  # of the head's roll and pitch in the vehicle [deg]
@@ -167,7 +167,7 @@ def cost(rounds: int) -> tuple[float, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = row_options(__doc__, [*ROWS, "cost"])
+    parser = row_options(__doc__, [*ROWS, "cost"], cores())
     arguments = parser.parse_args()
     rows = [name for name in arguments.rows if name != "cost"]
     if "cost" in arguments.rows:

@@ -24,7 +24,6 @@ from scipy.stats import chi2
 from fault_campaign.earth import Array
 from fault_campaign.instruments import Hidden, log_table
 from fault_campaign.motion import Motion
-from rovgraph.lab.executors import cores
 
 HONEST_NEES = 2.0
 LIE_NEES = 4.5  # of a dive that must not be trusted: a position is 3 of its stated sds off
@@ -355,13 +354,13 @@ class Outcome:
         return max(found, key=lambda entry: entry[1], default=("", float("nan")))
 
 
-def row_options(doc: str | None, rows: Iterable[str]) -> argparse.ArgumentParser:
+def row_options(doc: str | None, rows: Iterable[str], jobs: int) -> argparse.ArgumentParser:
     """Options of a benchmark that prints a row for some dives each."""
     names = list(rows)
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", nargs="+", choices=names, default=names, metavar="ROW")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=cores())
+    parser.add_argument("--jobs", type=int, default=jobs)
     parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
     parser.add_argument("--said", action="store_true", help="print what the first dive of each row says")
     parser.add_argument("--keep", type=Path, help="write the first dive of each row into a folder here")
