@@ -78,14 +78,17 @@ GYRO, FORCE = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
 
 
 def free_inertial(latitude: float, _seed: int, _online: bool) -> Result:
-    """Ten minutes of the same samples through both mechanisations, from the same state."""
+    """Ten minutes of the same samples through both mechanisations, from the same state.
+
+    Between samples at 100 Hz both leave out some of the rolling, 5 to 15 mm, and a sixteenth of that at 400 Hz.
+    """
     from pyins import sim, strapdown
 
-    t, interval = np.arange(60001) * 0.01, 20
+    t, interval = np.arange(240001) / 400.0, 40
     heading = np.deg2rad(40.0) + 1.2 * np.sin(2.0 * np.pi * t / 170.0)
     speed = 2.0 + 0.5 * np.sin(2.0 * np.pi * t / 60.0)
     v_n = np.column_stack([speed * np.cos(heading), speed * np.sin(heading), 0.0 * t])
-    rph = np.column_stack([5.0 * np.sin(t / 3.0), 4.0 * np.sin(t / 4.0 + 1.0), np.rad2deg(heading)])
+    rph = np.column_stack([3.0 * np.sin(t / 6.0), 2.0 * np.sin(t / 8.0 + 1.0), np.rad2deg(heading)])
     way, imu = sim.generate_imu(t, [latitude, 20.0, 0.0], rph, v_n, "rate")
     integrator = strapdown.Integrator(way.iloc[0], with_altitude=False)
     judge = integrator.integrate(strapdown.compute_increments_from_imu(imu, "rate"))
@@ -227,9 +230,8 @@ def honest(results: Sequence[Result]) -> tuple[str, bool]:
         if not (done := [r for r in results if kind in r.nees]):
             continue
         rms = float(np.sqrt(np.mean([r.found[f"{kind} end"] ** 2 for r in done])))
-        end, heading = (
-            float(np.mean(x)) for x in zip(*((r.found[f"{kind} nees"], r.nees[kind]["heading"]) for r in done))
-        )
+        end = float(np.mean([r.found[f"{kind} nees"] for r in done]))
+        heading = float(np.mean([r.nees[kind]["heading"] for r in done]))
         cells.append(f"{kind} {rms:.0f} m at the end, NEES {end:.2f}, heading {heading:.2f}")
         met &= low <= end <= high and heading <= high
     return "; ".join(cells) + f" (band {low:.2f} to {high:.2f})", met
