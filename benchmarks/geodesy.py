@@ -124,7 +124,7 @@ def exact_transit(latitude: float, longitude: float, _seed: int, _online: bool) 
     log.columns = pd.Index(["time", *(f"{name}_{axis}" for name in ("acc", "gyr") for axis in "xyz")])
     log.loc[::every, ["dvl_vx", "dvl_vy", "dvl_vz"]] = v_n @ matrix_from_rpy(rpy)[0]
     log.loc[::every, "depth"] = 0.0
-    true = way[["lat", "lon"]].to_numpy()
+    true = way[["lat", "lon"]].to_numpy().copy()
     true[:, 1] = (true[:, 1] + 180.0) % 360.0 - 180.0
     for k in (0, len(t) - 1):
         log.loc[k, ["fix_lat", "fix_lon"]] = true[k]
