@@ -658,7 +658,7 @@ def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, flo
 
     Raises
     ------
-    InputError : the latitude is unknown; what the frame does not take yet
+    InputError : the latitude is unknown, or too high
     """
     env, latitude = config.environment, config.environment.latitude_deg if log.origin is None else log.origin[0]
     if latitude is None:
@@ -669,11 +669,6 @@ def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, flo
         raise InputError(
             f"environment.frame: earth reaches to latitude {HIGHEST_LATITUDE_DEG:g} deg, and the origin is at "
             f"{latitude:.4g}; state environment.frame: flat"
-        )
-    if heard := sorted(log.sensors & {*ACOUSTICS}):
-        raise InputError(
-            f"environment.frame: earth does not take acoustic positions and ranges yet, and the log has {heard[0]}; "
-            "state environment.frame: flat, or leave these columns out"
         )
     if has_constant_velocity(config):
         changes: dict[str, float] = {}
