@@ -182,9 +182,9 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     motion = Transit(seconds, heading, speeds, *tilt, 2.0, origin, flat=flat)
     vehicle = make_vehicle(grade, ("ahrs", "depth"))
     vehicle.imu = replace(vehicle.imu, rate=20.0)
-    vehicle.dvl = Dvl(rate=1.0, mount_rpy_deg=(0.0, 0.0, 0.0), yaw_sd=0.2)
-    vehicle.ahrs = replace(vehicle.ahrs, rate=1.0, offset_sd=0.5, curve_sd=0.3)
-    vehicle.depth = replace(vehicle.depth, rate=1.0)
+    vehicle.dvl = Dvl(rate=0.5, mount_rpy_deg=(0.0, 0.0, 0.0), yaw_sd=0.2)
+    vehicle.ahrs = replace(vehicle.ahrs, rate=0.5, offset_sd=0.5, curve_sd=0.3)
+    vehicle.depth = replace(vehicle.depth, rate=0.5)
     streams, hidden = sample(motion, vehicle, rng)
     t = np.arange(1.0, FIXED_S)
     lat, lon, _ = motion.geodetic(t).T
