@@ -144,7 +144,7 @@ def test_fixes_so_far_from_the_origin_that_it_must_be_wrong_are_refused_unless_t
         if fits:
             assert rovgraph.read_log(tmp_path / "log.csv", settings).origin == origin
         else:
-            with pytest.raises(InputError, match="km from environment.origin_lat_deg.*or state environment.frame"):
+            with pytest.raises(InputError, match=r"km from environment.origin_lat_deg.*or state environment.frame"):
                 rovgraph.read_log(tmp_path / "log.csv", settings)
 
 
