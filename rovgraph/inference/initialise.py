@@ -593,7 +593,6 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             f"WMM2025 at the origin and the date of the log{', which the model does not reach' * field.expired}"
         )
     frame = _frame(log, config)
-    changes["frame"] = frame
     if log.origin is not None and (env.latitude_deg is None or frame == "earth"):
         changes["latitude_deg"] = log.origin[0]
     if frame == "earth":
@@ -602,7 +601,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
         raise InputError(
             "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
         )
-    env = env.model_copy(update=changes)
+    env = env.model_copy(update={**changes, "frame": frame})
     if env.gravity_mps2 is None:
         env = env.model_copy(update={"gravity_mps2": _gravity(log, config, env, assumptions)})
     return config.model_copy(update={"environment": env})
@@ -672,7 +671,7 @@ def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, flo
         )
     if has_constant_velocity(config):
         changes: dict[str, float] = {}
-    elif "earth_rotation" in env.model_fields_set and not env.earth_rotation:
+    elif env.earth_rotation is False:
         raise InputError("environment.frame: earth turns with the Earth; remove environment.earth_rotation: false")
     else:
         changes = {"earth_rotation": True}

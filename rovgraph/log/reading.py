@@ -392,7 +392,8 @@ def _origin(config: Config, parts: Sequence[dict[str, Array]], source: str) -> O
     if stated is None and not len(places):
         return None
     lat, lon = places[0].tolist() if stated is None else stated
-    away = float(np.median(np.hypot(*north_east(*places.T, EarthOrigin(lat, lon))))) if len(places) else 0.0
+    north, east = north_east(places[:, 0], places[:, 1], EarthOrigin(lat, lon))
+    away = float(np.median(np.hypot(north, east))) if len(places) else 0.0
     way = 0.0
     for cells in parts:
         if {*cells} >= VELOCITY and "fix_north" not in cells:  # which is of a plane

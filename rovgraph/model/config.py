@@ -403,8 +403,7 @@ class Config(ConfigSection):
         env = self.environment
         if env.frame != "auto":
             return env.frame
-        held = "earth_rotation" in env.model_fields_set and not env.earth_rotation
-        if latitude is None or held or not env.has_latitude(latitude):
+        if latitude is None or env.earth_rotation is False or not env.has_latitude(latitude):
             return "flat"
         good = self.imu.gyr_bias_sd_dps <= GOOD_GYRO_DPS
         return "earth" if good or outgrows_plane(latitude, away, way) else "flat"

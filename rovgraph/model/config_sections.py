@@ -103,7 +103,9 @@ class Environment(ConfigSection):
     dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
         None, description="dip of the field, down positive; null = from the log, against gravity"
     )
-    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros measure")
+    earth_rotation: bool | None = Field(
+        None, description="model the Earth's rotation, which good gyros measure; null = in frame earth only"
+    )
 
     @model_validator(mode="after")
     def _whole_origin(self) -> Self:
