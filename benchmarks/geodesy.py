@@ -179,9 +179,9 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     tilt = [Profile(0.0, (), ((0.03, period, rng.uniform(0.0, 6.0)),)) for period in (9.0, 8.0)]
     speeds = Profile(0.0, ((5.0, 20.0, SPEED),)), Profile(0.0, (), ((0.03, 13.0, 1.0),)), Profile()
     origin = (np.deg2rad(place[0]), np.deg2rad(place[1]))
-    motion = Transit(seconds, heading, speeds, *tilt, 2.0, origin, flat=flat)
+    motion = Transit(seconds, heading, speeds, *tilt, 2.0, origin, flat=flat, step=0.1)
     vehicle = make_vehicle(grade, ("ahrs", "depth"))
-    vehicle.imu = replace(vehicle.imu, rate=20.0)
+    vehicle.imu = replace(vehicle.imu, rate=10.0)
     vehicle.dvl = Dvl(rate=0.5, mount_rpy_deg=(0.0, 0.0, 0.0), yaw_sd=0.2)
     vehicle.ahrs = replace(vehicle.ahrs, rate=0.5, offset_sd=0.5, curve_sd=0.3)
     vehicle.depth = replace(vehicle.depth, rate=0.5)
@@ -197,7 +197,7 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     config: dict[str, Any] = configuration(vehicle)
     for key in ("gravity_mps2", "latitude_deg", "earth_rotation") if not flat else ("gravity_mps2",):
         del config["environment"][key]
-    config = merge(config, {"environment": stated, "start": {"position_sd_m": 1.0}})
+    config = merge(config, {"environment": stated, "start": {"position_sd_m": 1.0}, "graph": {"max_gap_s": 2.5}})
     if flat:
         config["environment"] |= {"latitude_deg": place[0], "earth_rotation": grade == "fog"}
     return Dive(streams, config, motion, hidden)
