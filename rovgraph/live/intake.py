@@ -249,8 +249,8 @@ class Intake:
 
 
 def origin_of(state: Mapping[str, Any]) -> Origin | None:
-    """The origin in a checkpoint; a frame is not in one of an earlier version."""
-    return None if state["origin"] is None else origin_in(state.get("frame", "flat"), *state["origin"])
+    """The origin in a checkpoint."""
+    return None if state["origin"] is None else origin_in(state["frame"], *state["origin"])
 
 
 MARGIN_S = 0.5  # beyond the window, for data that come late

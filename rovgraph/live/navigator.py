@@ -273,8 +273,7 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
-        if "surface" in state:  # not of an earlier version
-            self._intake.pressure.surface.restore(state["surface"].tolist())
+        self._intake.pressure.surface.restore(state["surface"].tolist())
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
