@@ -158,22 +158,27 @@ def test_a_log_of_the_other_frame_is_refused(tmp_path):
         rovgraph.smooth(replace(flat, config=None), rovgraph.parse_config(json.dumps(config())))
 
 
+def messages(log: pd.DataFrame, begin: float, end: float) -> list[Message]:
+    """Rows of a log as a vehicle sends them."""
+    out = []
+    for _, row in log[(log["time"] >= begin) & (log["time"] < end)].iterrows():
+        values = {
+            "imu": row.iloc[1:7],
+            "dvl": [*row[["dvl_vx", "dvl_vy", "dvl_vz"]], 1.0, np.nan],
+            "depth": row[["depth"]],
+            GEODETIC: [*row[["fix_lat", "fix_lon"]], np.nan],
+        }
+        arrays = {sensor: np.array(v, float) for sensor, v in values.items()}
+        readings = tuple(Reading(sensor, v) for sensor, v in arrays.items() if np.isfinite(v[0]))
+        out.append(Message("sim", row["time"], row["time"], readings))
+    return out
+
+
 def test_a_dive_crosses_the_date_line_live_and_goes_on_from_a_checkpoint(tmp_path):
     log, truth = transit(70.0, 179.9998, 20.0, 10.0)
     settings = rovgraph.parse_config(json.dumps(config()))
-
-    def messages(begin: float, end: float) -> list[Message]:
-        out = []
-        for _, row in log[(log["time"] >= begin) & (log["time"] < end)].iterrows():
-            values = {"imu": row.iloc[1:7], "dvl": [*row[["dvl_vx", "dvl_vy", "dvl_vz"]], 1.0, np.nan],
-                      "depth": row[["depth"]], GEODETIC: [*row[["fix_lat", "fix_lon"]], np.nan]}  # fmt: skip
-            arrays = {sensor: np.array(v, float) for sensor, v in values.items()}
-            readings = [Reading(sensor, v) for sensor, v in arrays.items() if np.isfinite(v[0])]
-            out.append(Message("sim", row["time"], row["time"], tuple(readings)))
-        return out
-
     first = Navigator(settings, patient=True, reinitialise=False, clocks=Clocks(trust=True))
-    for message in messages(0.0, 14.0):
+    for message in messages(log, 0.0, 14.0):
         first.take(message)
     write_checkpoint(tmp_path / "checkpoint", first.state())
     second = Navigator(settings, patient=True, reinitialise=False, clocks=Clocks(trust=True))
@@ -181,7 +186,7 @@ def test_a_dive_crosses_the_date_line_live_and_goes_on_from_a_checkpoint(tmp_pat
     assert isinstance(second.origin, EarthOrigin) and second.origin == first.origin
     known = second.time
     for navigator, begin in ((first, 14.0), (second, known + 1e-6)):
-        for message in messages(begin, 41.0):
+        for message in messages(log, begin, 41.0):
             navigator.take(message)
     solutions = first.solution(), second.solution()
     for solution in solutions:
@@ -198,6 +203,21 @@ def test_online_waits_for_the_place_where_the_frame_is_stated():
     for _, row in log.iterrows():
         navigator.take(Message("sim", row["time"], row["time"], (Reading("imu", np.array(row.iloc[1:7], float)),)))
     assert navigator.engine is None and "origin_lat_deg" in navigator.waits_for
+
+
+def test_online_tells_once_when_a_plane_that_was_not_stated_is_wrong():
+    log, _ = transit(70.0, 10.0, 9.0, 10.0)
+    place = {"origin_lat_deg": 70.0, "origin_lon_deg": 9.9}  # 3.8 km away, where 2.3 km is the limit
+    for frame, warnings in (("auto", 1), ("flat", 0)):
+        stated = config(frame=frame, **place)
+        stated["imu"]["gyr_bias_sd_dps"] = 0.01
+        settings = rovgraph.parse_config(json.dumps(stated))
+        navigator = Navigator(settings, reinitialise=False, clocks=Clocks(trust=True))
+        events = []
+        for message in messages(log, 0.0, 10.0):
+            navigator.take(message)
+            events += [] if (solution := navigator.solution()) is None else solution.events
+        assert sum("a flat frame is wrong by" in event.text for event in events) == warnings
 
 
 @pytest.mark.parametrize("latitude", [0.0, 70.0, -60.0])
