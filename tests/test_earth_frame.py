@@ -25,6 +25,7 @@ from rovgraph.model.config import Config
 from rovgraph.model.origin import EarthOrigin, frame_of, lat_lon, north_east
 from rovgraph.model.state import State
 from rovgraph.problem.motion import preintegrate, preintegration_params
+from rovgraph.report.export.track import track_of
 from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate.dive import specific_force_and_rate
 from rovgraph.simulate.path import Path as SimulatedPath
@@ -272,11 +273,28 @@ def test_a_fix_with_the_last_ping_counts(tmp_path):
     assert fixes["time"].unique().tolist() == [0.0, 20.0]
 
 
+def test_results_keep_their_frame_and_those_of_before_are_flat(tmp_path):
+    log, truth = transit(70.0, 179.9999, 10.0, 20.0)
+    log.to_csv(tmp_path / "log.csv", index=False, float_format="%.12g")
+    settings = rovgraph.parse_config(json.dumps(config()))
+    result = rovgraph.smooth(rovgraph.read_log(tmp_path / "log.csv", settings), settings)
+    summary = result.save(tmp_path / "out", figures=False, page=False)
+    assert summary["frame"] == "earth"
+    track = track_of(tmp_path / "out")
+    assert isinstance(track.origin, EarthOrigin) and isinstance(result.track().origin, EarthOrigin)
+    np.testing.assert_allclose(np.column_stack(track.lat_lon)[-1], truth[-1], atol=1e-7)
+    assert isinstance(track.placed((60.0, 5.0), 0.0).origin, EarthOrigin)
+    text = (tmp_path / "out" / "summary.json").read_text()
+    (tmp_path / "out" / "summary.json").write_text(text.replace('"frame": "earth",', ""))
+    assert frame_of(track_of(tmp_path / "out").origin) == "flat"
+
+
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
         ({"latitude_deg": 50.0, "origin_lat_deg": 60.0, "origin_lon_deg": 5.0}, "takes the latitude of the origin"),
         ({"latitude_deg": 86.0}, "reaches to latitude 85"),
+        ({"origin_lat_deg": 90.0, "origin_lon_deg": 0.0}, "reaches to latitude 85"),
         ({"frame": "round"}, "frame"),
     ],
 )
