@@ -4,10 +4,12 @@ This docstring is the contract for frames, units and names in the whole package.
 
 Frames
 ------
-n : navigation frame, north-east-down (NED), flat, local origin, taken as inertial
-    unless ``environment.earth_rotation`` is set. With ``environment.frame: earth`` its axes
-    are those of the meridian where the vehicle is, and north and east are latitude and
-    longitude on WGS 84, as metres at the scale of the origin.
+n : navigation frame, north-east-down (NED). With ``environment.frame: flat`` it is the plane
+    that touches WGS 84 at the origin, taken as inertial unless ``environment.earth_rotation``
+    is set. With ``earth`` its axes are those of the meridian where the vehicle is, and
+    positions are latitude and longitude, as metres at the scale of the origin
+    (``rovgraph.kernels.earth``); velocities are metres a second over ground in both.
+    ``auto`` is one of them by latitude, way and gyro (docs/geodesy.md).
 b : body frame, forward-right-down (FRD): x forward, y starboard, z down.
 s : sensor frame. A sensor's mounting is ``R_bs`` (sensor to body, written
     ``mount_rpy_deg`` in a configuration) and ``lever_arm_b`` (metres, body axes).

@@ -53,6 +53,7 @@ def context(rng: np.random.Generator, n: int, inverted: bool, ways: float, beaco
     x[:, at.SEEN : at.SEEN + 3] = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     x[:, at.WAIT : at.WAIT + 2] = rng.normal(0, 0.1, (n, 2))
     x[:, at.STATED], x[:, at.SINCE], x[:, at.WAYS], x[:, at.INVERTED] = 0.1, 7.0, ways, inverted
+    x[:, at.ORIGIN] = np.nan
     x[:, at.MOUNT_AT : at.WIDTH] = [
         LAYOUT[name].start
         for name in (
@@ -75,9 +76,14 @@ def state(rng: np.random.Generator, n: int) -> State:
 @pytest.mark.parametrize("inverted", [False, True])
 @pytest.mark.parametrize("ways", [1.0, 2.0])
 @pytest.mark.parametrize("dim", [1, 3])
-def test_derivatives_of_an_exchange_are_those_of_finite_differences(inverted: bool, ways: float, dim: int) -> None:
+@pytest.mark.parametrize("latitude", [np.nan, 0.8], ids=["flat", "earth"])
+def test_derivatives_of_an_exchange_are_those_of_finite_differences(
+    inverted: bool, ways: float, dim: int, latitude: float
+) -> None:
     rng, n, step = np.random.default_rng(3), 20, 1e-6
-    model = AcousticExchange("usbl", dim, np.zeros(3), VARIABLES, context(rng, n, inverted, ways, dim == 1))
+    x = context(rng, n, inverted, ways, dim == 1)
+    x[:, at.ORIGIN] = latitude
+    model = AcousticExchange("usbl", dim, np.zeros(3), VARIABLES, x)
     at_state, still = state(rng, n), np.zeros((n, 3))
     _, H = model.predict(at_state, still)
     for variable, jacobian in H.items():

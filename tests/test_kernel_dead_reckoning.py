@@ -34,7 +34,7 @@ def reckoned(
         "compass": np.tile([0.0, math.inf, 0.0], (n, 1)),
         "reference": np.tile(np.eye(3), (n, 1, 1)),
     } | rows
-    around = Surroundings(G, 2.0, held, SD[1, 0] ** 2, np.array(w_ie_n, float), np.zeros(3))
+    around = Surroundings(G, 2.0, held, SD[1, 0] ** 2, np.array(w_ie_n, float), np.nan, np.zeros(3))
     R, b = np.empty((n, 3, 3)), np.empty((n, 3))
     start = R_nb if start is None else start
     P = np.array([np.diag(sd**2) for sd in SD])
@@ -80,7 +80,7 @@ def test_the_velocity_of_pings_is_told_from_tilt():
         R, b = np.empty((n, 3, 3)), np.empty((n, 3))
         dt = np.append(0.0, np.full(n - 1, DT))
         dv = dt[:, None] * np.array([gained, 0.0, -G])
-        around = Surroundings(G, 2.0, 1.0, 0.0, np.zeros(3), np.zeros(3))
+        around = Surroundings(G, 2.0, 1.0, 0.0, np.zeros(3), np.nan, np.zeros(3))
         nothing, same = np.tile([0.0, math.inf, 0.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
         P = np.array([np.diag(sd**2) for sd in SD])
         motions = Motions(np.zeros(n, bool), dt, same, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)))

@@ -24,6 +24,7 @@ from rovgraph.errors import InputError
 from rovgraph.live.marks import DropMark, Marks, RemoveMark, SetPosition
 from rovgraph.live.session import Feed
 from rovgraph.live.solution import Event, SensorHealth, Solution
+from rovgraph.model.origin import lat_lon
 from rovgraph.web import broadcast
 from rovgraph.web import broadcast as broadcasting
 from rovgraph.web import view as tracking
@@ -112,7 +113,7 @@ def test_the_page_raises_an_alarm_beyond_its_limits(server, change, kind):
 def test_the_track_is_geojson_where_the_origin_is_known(server):
     server.show(*(solution(float(k), 10.0 * k) for k in range(3)))
     assert server.client.get("/api/track.geojson").json()["geometry"] is None
-    server.show(solution(3.0, 30.0, latitude=58.0, longitude=15.0))
+    server.show(solution(3.0, 30.0, origin=lat_lon(-30.0, -2.0, (58.0, 15.0))))
     track = server.client.get("/api/track.geojson").json()
     first, *_, last = track["geometry"]["coordinates"]
     assert last == pytest.approx([15.0, 58.0, -3.0], abs=1e-6)
@@ -401,7 +402,7 @@ def test_charts_are_placed_once_the_origin_is_known(tmp_path):
     (tmp_path / "c.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": shapes}))
     server = Server(charts=read_charts([tmp_path / "c.geojson"]))
     assert "origin" in server.client.get("/api/charts").json()["missing"]
-    server.show(solution(0.0, 100.0, latitude=58.0, longitude=15.0))
+    server.show(solution(0.0, 100.0, origin=lat_lon(-100.0, -2.0, (58.0, 15.0))))
     area, point = server.client.get("/api/charts").json()["charts"][0]["shapes"]
     assert area["name"] == NASTY and area["form"] == "area"
     assert point["points"][0] == pytest.approx([100.0, 2.0], abs=0.01)
@@ -418,7 +419,7 @@ def test_a_geotiff_lies_where_its_coordinates_say(tmp_path):
     ) as file:  # fmt: skip
         file.write(values)
     server = Server(charts=read_charts([tmp_path / "c.tif"]))
-    server.show(solution(latitude=58.0, longitude=15.0))
+    server.show(solution(origin=lat_lon(0.0, -2.0, (58.0, 15.0))))
     (chart,) = server.client.get("/api/charts").json()["charts"]
     corner, right, below = np.array(chart["corners"])
     assert np.linalg.norm(right - corner) == pytest.approx(20.0, rel=2e-3)

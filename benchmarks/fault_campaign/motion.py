@@ -20,7 +20,6 @@ import numpy as np
 from fault_campaign import earth
 from fault_campaign.earth import Array
 
-STEP = 0.01  # between the epochs where the position is integrated [s]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # over one sample period
 ORIGIN = (np.deg2rad(58.3), np.deg2rad(14.6))  # latitude and longitude where dives begin
 
@@ -92,6 +91,7 @@ class Motion:
     velocity_b : three profiles [m/s]
     depth : of the start [m]
     origin : latitude and longitude of the start [rad]
+    step : between the epochs where the position is integrated [s]
     """
 
     duration: float
@@ -101,6 +101,7 @@ class Motion:
     pitch: Profile = Profile()
     depth: float = 2.0
     origin: tuple[float, float] = field(default=ORIGIN)
+    step: float = field(default=0.01, kw_only=True)
 
     def C_nb(self, t: Array) -> Array:
         """Attitude, shape (n, 3, 3)."""
@@ -126,11 +127,11 @@ class Motion:
     @cached_property
     def _grid(self) -> tuple[Array, Array]:
         """Epochs, and latitude, longitude and height at them, shape (n, 3), by Simpson's rule."""
-        t = np.arange(-10.0, self.duration + 10.0 + STEP, STEP)
-        v, middle = self.v_n(t), self.v_n(t[:-1] + STEP / 2)
+        t = np.arange(-10.0, self.duration + 10.0 + self.step, self.step)
+        v, middle = self.v_n(t), self.v_n(t[:-1] + self.step / 2)
 
         def integrate(f: Array, f_middle: Array) -> Array:
-            steps = STEP / 6.0 * (f[:-1] + 4.0 * f_middle + f[1:])
+            steps = self.step / 6.0 * (f[:-1] + 4.0 * f_middle + f[1:])
             total = np.concatenate([[0.0], np.cumsum(steps)])
             return total - np.interp(0.0, t, total)
 
@@ -152,9 +153,9 @@ class Motion:
         """Latitude [rad], longitude [rad] and height [m], shape (n, 3): cubic Hermite between the grid's epochs."""
         grid, position = self._grid
         k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
-        x = ((t - grid[k]) / STEP)[:, None]
+        x = ((t - grid[k]) / self.step)[:, None]
         ends = [position[k + end] for end in (0, 1)]
-        slopes = [STEP * self._geodetic_rate(p, self.v_n(grid[k + end])) for end, p in enumerate(ends)]
+        slopes = [self.step * self._geodetic_rate(p, self.v_n(grid[k + end])) for end, p in enumerate(ends)]
         value = (1.0 + 2.0 * x) * (1.0 - x) ** 2 * ends[0] + x**2 * (3.0 - 2.0 * x) * ends[1]
         return np.asarray(value + x * (1.0 - x) ** 2 * slopes[0] - x**2 * (1.0 - x) * slopes[1])
 

@@ -19,6 +19,7 @@ from rovgraph.inference.bottom import Bottom, bottom_of
 from rovgraph.inference.estimate import CalibrationEstimate, Estimate
 from rovgraph.log import Log
 from rovgraph.model.config import Config
+from rovgraph.model.origin import Frame
 from rovgraph.process import Progress, no_progress
 from rovgraph.report.export import ExportOptions, Track, acoustics_of, fixes_of, write_track
 from rovgraph.report.export.track import ESTIMATES as TRACKS
@@ -183,8 +184,17 @@ class Result:
         fixes = fixes_of(self.main.residuals)
         bottom = bottom_of(self.log, self.config, chosen)
         soundings = None if bottom is None else bottom.soundings
-        origin = self.log.origin
-        return Track(name, chosen.kind, chosen.trajectory, origin, fixes, acoustics=acoustics, soundings=soundings)
+        frame: Frame = "earth" if self.config.environment.frame == "earth" else "flat"
+        return Track(
+            name,
+            chosen.kind,
+            chosen.trajectory,
+            self.log.origin,
+            fixes,
+            acoustics=acoustics,
+            soundings=soundings,
+            frame=frame,
+        )
 
     def save(
         self,

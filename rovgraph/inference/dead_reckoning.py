@@ -208,7 +208,8 @@ def _attitudes(
     P[0] = np.diag([start.v_sd.max(), start.rpy_sd[:2].max(), gyr_sd]) ** 2
     P[1] = np.diag([0.0, start.rpy_sd[2], gyr_sd]) ** 2
     held, arm = 2.0 * KEEPS_HEADING_S * HELD_SD**2, np.require(bottom.arm, float, ("C", "W"))
-    around = Surroundings(env.gravity, PING_VALID_S, held, 0.0, _earth_rate(config), arm)
+    latitude = latitude_at(env.earth_latitude, start.state.p_n[0, 0])
+    around = Surroundings(env.gravity, PING_VALID_S, held, 0.0, _earth_rate(config), float(latitude), arm)
     dv = epochs.dv - epochs.dt[:, None] * (bias[:3] - epochs.assumed[:, :3])
     assumed, densities = epochs.assumed[:, 3:].copy(), _densities(epochs, config)
     motions = Motions(epochs.outage, epochs.dt, epochs.dR, dv, assumed, densities)

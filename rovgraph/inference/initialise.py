@@ -35,10 +35,11 @@ from rovgraph.kernels.assembly import NOISIER
 from rovgraph.kernels.earth import normal_gravity
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import CLEAR_SPEED
-from rovgraph.log.reading import water_at
+from rovgraph.log.reading import length_of_way, water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
-from rovgraph.model.config import Config, beliefs, mount_matrix, with_priors_stated
+from rovgraph.model.config import GOOD_GYRO_DPS, Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.config_sections import HIGHEST_LATITUDE_DEG, Environment
+from rovgraph.model.origin import Frame, frame_of
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
@@ -591,15 +592,16 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             f"environment.declination_deg {field.declination_deg:.2f} within {field.declination_sd_deg:.1f} deg, by "
             f"WMM2025 at the origin and the date of the log{', which the model does not reach' * field.expired}"
         )
-    if log.origin is not None and (env.latitude_deg is None or env.frame == "earth"):
+    frame = _frame(log, config)
+    if log.origin is not None and (env.latitude_deg is None or frame == "earth"):
         changes["latitude_deg"] = log.origin[0]
-    if env.frame == "earth":
+    if frame == "earth":
         changes |= _on_earth(log, config, assumptions)
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
         raise InputError(
             "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
         )
-    env = env.model_copy(update=changes)
+    env = env.model_copy(update={**changes, "frame": frame})
     if env.gravity_mps2 is None:
         env = env.model_copy(update={"gravity_mps2": _gravity(log, config, env, assumptions)})
     return config.model_copy(update={"environment": env})
@@ -631,12 +633,31 @@ def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str])
     return gravity
 
 
+def _frame(log: Log, config: Config) -> Frame:
+    """The frame of a dive: that of its origin, or by its latitude alone.
+
+    Raises
+    ------
+    InputError : its fixes are in the other one
+    """
+    if log.origin is None:
+        way = length_of_way(log["dvl"].time, log["dvl"].data[:, :3]) if "dvl" in log else 0.0
+        return config.frame_at(config.environment.latitude, way=way)
+    frame = frame_of(log.origin)
+    if config.environment.frame not in ("auto", frame):
+        raise InputError(
+            f"{log.source}: was read in frame {frame}, and environment.frame is {config.environment.frame}; "
+            "read it with this configuration"
+        )
+    return frame
+
+
 def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, float]:
     """What frame "earth" sets: the Earth's rotation, and gravity at the origin where it is not stated.
 
     Raises
     ------
-    InputError : the latitude is unknown; what the frame does not take yet
+    InputError : the latitude is unknown, or too high
     """
     env, latitude = config.environment, config.environment.latitude_deg if log.origin is None else log.origin[0]
     if latitude is None:
@@ -648,18 +669,16 @@ def _on_earth(log: Log, config: Config, assumptions: list[str]) -> dict[str, flo
             f"environment.frame: earth reaches to latitude {HIGHEST_LATITUDE_DEG:g} deg, and the origin is at "
             f"{latitude:.4g}; state environment.frame: flat"
         )
-    if heard := sorted(log.sensors & {*ACOUSTICS}):
-        raise InputError(
-            f"environment.frame: earth does not take acoustic positions and ranges yet, and the log has {heard[0]}; "
-            "state environment.frame: flat, or leave these columns out"
-        )
     if has_constant_velocity(config):
         changes: dict[str, float] = {}
-    elif "earth_rotation" in env.model_fields_set and not env.earth_rotation:
+    elif env.earth_rotation is False:
         raise InputError("environment.frame: earth turns with the Earth; remove environment.earth_rotation: false")
     else:
         changes = {"earth_rotation": True}
     text = f"frame earth: WGS 84 at latitude {latitude:.4g} deg, with the Earth's rotation"
+    if env.frame == "auto":
+        good = config.imu.gyr_bias_sd_dps <= GOOD_GYRO_DPS
+        text += f" ({'as the gyro is good' if good else 'as the way is too long for a plane'})"
     if env.gravity_mps2 is None:
         changes["gravity_mps2"] = normal_gravity(float(np.deg2rad(latitude)))
         text += f" and normal gravity, {changes['gravity_mps2']:.5f} m/s2 at the origin"

@@ -30,7 +30,7 @@ from rovgraph.geometry import (
 )
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
-from rovgraph.model.origin import lat_lon
+from rovgraph.model.origin import Origin, lat_lon
 
 if TYPE_CHECKING:
     import xarray
@@ -239,7 +239,7 @@ class Trajectory:
         coords = {t: (t, self.time, {"units": "s"}), n[0]: n[1], "n2": n[1], b[0]: b[1], "angle": ATTITUDE}
         return xarray.Dataset(made, coords)
 
-    def geodetic(self, origin: tuple[float, float]) -> tuple[Array, Array]:
+    def geodetic(self, origin: Origin) -> tuple[Array, Array]:
         """Latitude and longitude [deg], each of shape (n,).
 
         Parameters
@@ -252,7 +252,7 @@ class Trajectory:
         self,
         path: Path | str,
         more: bool = False,
-        origin: tuple[float, float] | None = None,
+        origin: Origin | None = None,
         unix: bool | None = None,
         also: Mapping[str, Array] | None = None,
     ) -> None:

@@ -277,7 +277,7 @@ def _look(streams: Streams, dive: DiveArrays, rule: KeyframeRule, until: float) 
 
 @helper
 def _finish(streams: Streams, dive: DiveArrays, rule: KeyframeRule) -> None:
-    """Place the rest, and a last keyframe at the last sample; returns what lies beyond them."""
+    """Place the rest, and a last keyframe at the last sample; one that stands there has what is measured with it."""
     events, order, counts = streams.events, streams.order, dive.counts
     end = streams.imu[counts[SAMPLES] - 1, 0]
     _look(streams, dive, rule, end)
@@ -291,7 +291,10 @@ def _finish(streams: Streams, dive: DiveArrays, rule: KeyframeRule) -> None:
         _stand(dive, rule, end, within, 0)
     else:
         for k in range(int(last[UPTO]), within):
-            events[order[k], FATE] = UNFINISHED
+            if streams.sensors[int(events[order[k], SENSOR]), ONCE] != 0:  # of an interval that there is not
+                events[order[k], FATE] = UNFINISHED
+        last[HERE] += within - last[UPTO]
+        last[UPTO] = within
 
 
 @helper
@@ -679,6 +682,7 @@ def assemble(
             keyframe[SPREAD] = _noise_of_rate(step, share, longest_step, keyframe[BELIEVED + 1])
         for j in range(int(keyframe[UPTO]) - int(keyframe[HERE]), int(keyframe[UPTO])):
             event = streams.events[streams.order[j]]
-            event[FATE] = _take(streams, rule, integration, dive, k, True, event, still)
+            if event[FATE] != UNFINISHED:
+                event[FATE] = _take(streams, rule, integration, dive, k, True, event, still)
         keyframe[TAKEN] = counts[ROWS]
         keyframe[FIRST], keyframe[LAST] = first + counts[FORGOTTEN], last + counts[FORGOTTEN]

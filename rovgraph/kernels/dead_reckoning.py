@@ -25,6 +25,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import Flags, Matrices, Matrix, Vector, helper, kernel
+from rovgraph.kernels.earth import radii, turning
 from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, rotate, rotate_back
 
 ANGLE, DRIFT = 1, 2  # components of a chain, after velocity or deviation
@@ -95,6 +96,7 @@ class Surroundings(NamedTuple):
     held : squared density of the noise of a velocity that is held from then on
     deviation_var : of the compass [rad^2]
     w_ie_n : rate of the Earth in n [rad/s]
+    latitude : where the dive begins in frame "earth", in which the former follows from it; NaN = n is flat [rad]
     arm : lever arm of the DVL from the IMU [m]
     """
 
@@ -103,6 +105,7 @@ class Surroundings(NamedTuple):
     held: float
     deviation_var: float
     w_ie_n: Vector
+    latitude: float
     arm: Vector
 
 
@@ -267,7 +270,8 @@ def reckon_attitude(
     """Attitude and gyro bias at m epochs, shapes (m, 3, 3), (m, 3), each after the measurement that it has."""
     outage, dt, dR, dv, assumed, density = motions
     dvl, compass, reference = aiding
-    gravity, valid_s, held, deviation_var, w_ie_n, arm = around
+    gravity, valid_s, held, deviation_var, w_ie_n, latitude, arm = around
+    w_in = w_ie_n.copy()
     R, bias, v_n, v_b = start.R.copy(), start.bias.copy(), np.zeros(3), np.zeros(3)
     tilt, heading, since_ping = (
         AxisFilter(start.P[0].copy(), np.zeros(3)),
@@ -283,7 +287,10 @@ def reckon_attitude(
             exp_rotation(moved, work[0])
             multiply(dR[k], work[0], turn)
             _propagate_attitude(known, turn, dv[k], outage[k], work)
-            _rotate_about_n(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
+            if not math.isnan(latitude):
+                turning(latitude, v_n, w_in)
+                latitude += dt[k] * v_n[0] / radii(latitude)[0]
+            _rotate_about_n(R, -dt[k] * w_in[0], -dt[k] * w_in[1], -dt[k] * w_in[2], work)
             kept = math.exp(-abs(math.atan2(turn[1, 0], turn[0, 0])) / DEVIATES_OVER)
             compass_history[DEVIATION] *= kept
             pull = 0.0 if outage[k] else gravity

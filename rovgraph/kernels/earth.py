@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rovgraph.geometry import Array
+from rovgraph.geometry import EARTH_RATE, Array
 from rovgraph.kernels.compile import helper
 
 Number = TypeVar("Number", float, Array)
@@ -46,6 +46,15 @@ def normal_gravity(latitude: Number) -> Number:
 def latitude_at(latitude_0: float, north: Number) -> Number:
     """Latitude [rad] at a north [m] from an origin of latitude ``latitude_0``."""
     return latitude_0 + north / radii(latitude_0)[0]
+
+
+@helper
+def turning(latitude: float, v_n: Array, rate_out: Array) -> None:
+    """Rate of the axes of n [rad/s] at the surface: of the Earth, and by the way over it."""
+    M, N = radii(latitude)
+    rate_out[0] = EARTH_RATE * np.cos(latitude) + v_n[1] / N
+    rate_out[1] = -v_n[0] / M
+    rate_out[2] = -EARTH_RATE * np.sin(latitude) - v_n[1] * np.tan(latitude) / N
 
 
 @helper

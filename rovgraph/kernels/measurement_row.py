@@ -25,6 +25,7 @@ context of an acoustic measurement
 `SINCE`            1  since the first of them, for a clock that drifts [s]
 `WAYS`             1  1 = one way, 2 = asked and answered, 0 = the range heard by one receiver less that by another
 `INVERTED`         1  1 = the head is on the vehicle, and the other end is what it sees
+`ORIGIN`           1  latitude of the origin of frame "earth" [rad]; NaN = n is flat
 `MOUNT_AT` ...    11  places in the calibration vector, or -1: the head's mounting (3), error of its arm (3), north and
                       east of a beacon (2), its depth, scale and offset of ranges, the clock's offset and drift, lasting
                       errors of direction (2) and of range, how late the stamp is
@@ -89,13 +90,13 @@ KIND, DIM, LOSS, LOSS_THRESHOLD, GATE, READMIT, SEES, SEEN_FRAME, GAIN, OFFSET, 
 )
 # a knot of a window: a snapshot from the keyframe, the rate [rad/s], how long before the stamp, nan behind the last [s]
 KNOT_DT, KNOT_RATE, KNOT_LAG, KNOT = 0, 16, 19, 20
-ARM, ASKED, HEARD, FRAME, MOVES, TURNS, SEEN, WAIT, STATED, SINCE, WAYS, INVERTED = (
-    0, 3, 6, 9, 18, 21, 24, 27, 29, 30, 31, 32
+ARM, ASKED, HEARD, FRAME, MOVES, TURNS, SEEN, WAIT, STATED, SINCE, WAYS, INVERTED, ORIGIN = (
+    0, 3, 6, 9, 18, 21, 24, 27, 29, 30, 31, 32, 33
 )  # fmt: skip
 MOUNT_AT, ARM_AT, BEACON_AT, DOWN_AT, SCALE_AT, OFFSET_AT, CLOCK_AT, DRIFT_AT, DIRECTION_AT, RANGE_AT, LATE_AT = range(
-    33, 44
+    34, 45
 )
-WIDTH = 44
+WIDTH = 45
 BEAM_ARM, BEAM, BEAM_TILT, ALTITUDE, BEAM_AT, BEAM_WIDTH = 0, 3, 6, 9, 10, 11
 LAYER_ARM, ABOVE_AT, BELOW_AT, SHARE, FIRST_KNOT, LAYER_WIDTH = 0, 3, 4, 5, 6, 7
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s

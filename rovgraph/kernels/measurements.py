@@ -79,6 +79,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import Index, Matrices, Matrix, kernel, view_helper
+from rovgraph.kernels.earth import latitude_at, scales
 from rovgraph.kernels.layout import (
     BOTTOM_VELOCITY,
     CURRENT,
@@ -125,6 +126,7 @@ from rovgraph.kernels.measurement_row import (
     MOUNT_AT,
     MOVES,
     OFFSET_AT,
+    ORIGIN,
     RANGE_AT,
     SCALE_AT,
     SEEN,
@@ -456,12 +458,27 @@ def _angle_factor(cosine: float) -> tuple[float, float]:
     return factor, (cosine * factor - 1.0) / square
 
 
+Scale = tuple[float, float, float]
+
+
 @view_helper
-def _by_ends(state: Epoch, x: Array, by: Array, F: Array, late: Array, row: Array, work: Array) -> None:
+def _metres(origin: float, p: Array, apart: Array) -> Scale:
+    """What a metre changes north, east and down by, halfway to a place that is ``apart``; ``origin``, its latitude.
+
+    Derivatives take it as constant: by a metre it changes by less than 1e-6 below a latitude of 80 deg.
+    """
+    if math.isnan(origin):
+        return 1.0, 1.0, 1.0
+    north, east = scales(origin, latitude_at(origin, p[0] - 0.5 * apart[0]), p[2] - 0.5 * apart[2])
+    return north, east, 1.0
+
+
+@view_helper
+def _by_ends(state: Epoch, x: Array, by: Array, scale: Scale, F: Array, late: Array, row: Array, work: Array) -> None:
     """Derivative of a component by all that moves the ends of an exchange.
 
-    ``by``, by them when asked and when heard, in n, and a row to work with; ``F`` is the attitude of the head's frame,
-    ``late`` how the other end goes with the time offset, reversed.
+    ``by``, by them when asked and when heard, in n, and a row to work with; ``scale``, what a metre changes north and
+    east by; ``F`` is the attitude of the head's frame, ``late`` how the other end goes with the time offset, reversed.
     """
     total, body, arm, turned = work[0], work[1], work[2], by[2]
     inverted, arm_at = x[INVERTED] != 0.0, int(x[ARM_AT])
@@ -473,18 +490,20 @@ def _by_ends(state: Epoch, x: Array, by: Array, F: Array, late: Array, row: Arra
         arm[i] = x[ARM + i]
         if inverted and arm_at >= 0:
             arm[i] += state.c[arm_at + i]
-        row[TRANSLATION + i] += body[i]
     cross(arm, body, turned)
     for i in range(3):
         row[i] += turned[i]
+        row[TRANSLATION + i] += (
+            state.R[0, i] * total[0] / scale[0] + state.R[1, i] * total[1] / scale[1] + state.R[2, i] * total[2]
+        )
     if arm_at >= 0:
         if not inverted:
             rotate_back(F, total, body)
         for i in range(3):
             row[MOTION + arm_at + i] += body[i] if inverted else -body[i]
     if x[BEACON_AT] >= 0.0:
-        row[MOTION + int(x[BEACON_AT])] -= total[0]
-        row[MOTION + int(x[BEACON_AT]) + 1] -= total[1]
+        row[MOTION + int(x[BEACON_AT])] -= total[0] / scale[0]
+        row[MOTION + int(x[BEACON_AT]) + 1] -= total[1] / scale[1]
     if x[DOWN_AT] >= 0.0:
         row[MOTION + int(x[DOWN_AT])] -= total[2]
     if x[LATE_AT] >= 0.0:
@@ -516,21 +535,25 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
     rotate(F, work[5, 2], late)  # how the other end goes with the offset, reversed
     for i in range(3):
         late[i] = x[MOVES + i] + (0.0 if inverted else late[i])
-        other = offset * x[MOVES + i] - (0.0 if inverted else work[5, 1, i])
+        other = 0.0
         if i < 2 and x[BEACON_AT] >= 0.0:
-            other -= c[int(x[BEACON_AT]) + i]
+            other = c[int(x[BEACON_AT]) + i]
         if i == 2 and x[DOWN_AT] >= 0.0:
-            other -= c[int(x[DOWN_AT])]
-        place = state.p[i] + there[i] + other
-        ends[0, i] = place + x[WAIT] * state.v[i] - x[ASKED + i]
-        ends[1, i] = place + x[WAIT + 1] * state.v[i] - x[HEARD + i]
+            other = c[int(x[DOWN_AT])]
+        ends[0, i] = state.p[i] - other - x[ASKED + i]
+        ends[1, i] = state.p[i] - other - x[HEARD + i]
+    scale = _metres(x[ORIGIN], state.p, ends[1])
+    for i in range(3):
+        place = there[i] + offset * x[MOVES + i] - (0.0 if inverted else work[5, 1, i])
+        ends[0, i] = ends[0, i] / scale[i] + place + x[WAIT] * state.v[i]
+        ends[1, i] = ends[1, i] / scale[i] + place + x[WAIT + 1] * state.v[i]
     by_asked, by_heard = 0.5, 0.5
     if x[WAYS] != 2.0:
         by_asked, by_heard = (0.0, 1.0) if x[WAYS] == 1.0 else (-1.0, 1.0)
     asked, heard = max(math.sqrt(dot(ends[0], ends[0])), 1e-6), max(math.sqrt(dot(ends[1], ends[1])), 1e-6)
     there_and_back = by_heard * heard + by_asked * asked
-    scale = 1.0 + (c[int(x[SCALE_AT])] if x[SCALE_AT] >= 0.0 else 0.0)
-    z_out[0] = scale * there_and_back
+    sound = 1.0 + (c[int(x[SCALE_AT])] if x[SCALE_AT] >= 0.0 else 0.0)
+    z_out[0] = sound * there_and_back
     for a in range(len(z_out)):
         for j in range(TRANSLATION + 6):
             H_out[a, j] = 0.0
@@ -540,9 +563,9 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
                 for j in range(dim):
                     H_out[a, MOTION + int(x[at]) + j] = 0.0
     for i in range(3):
-        by[0, i] = scale * by_asked * ends[0, i] / asked
-        by[1, i] = scale * by_heard * ends[1, i] / heard
-    _by_ends(state, x, by, F, late, H_out[0], spare)
+        by[0, i] = sound * by_asked * ends[0, i] / asked
+        by[1, i] = sound * by_heard * ends[1, i] / heard
+    _by_ends(state, x, by, scale, F, late, H_out[0], spare)
     if x[SCALE_AT] >= 0.0:
         H_out[0, MOTION + int(x[SCALE_AT])] = there_and_back
     for at in (OFFSET_AT, CLOCK_AT, RANGE_AT):
@@ -553,12 +576,12 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
         z_out[0] += x[SINCE] * c[int(x[DRIFT_AT])]
         H_out[0, MOTION + int(x[DRIFT_AT])] = x[SINCE]
     if len(z_out) == 3:
-        _direction(state, x, F, heard, late, z_out, H_out, work)
+        _direction(state, x, F, heard, scale, late, z_out, H_out, work)
 
 
 @view_helper
 def _direction(
-    state: Epoch, x: Array, F: Array, length: float, late: Array, z_out: Array, H_out: Array, work: Array
+    state: Epoch, x: Array, F: Array, length: float, scale: Scale, late: Array, z_out: Array, H_out: Array, work: Array
 ) -> None:
     """Components 1 and 2 of `acoustic`: across and up from the direction that is measured."""
     c, inverted, mount = state.c, x[INVERTED] != 0.0, int(x[MOUNT_AT])
@@ -606,7 +629,7 @@ def _direction(
         off = dot(turned, u_n)
         for i in range(3):
             by[0, i], by[1, i] = 0.0, sense * (turned[i] - off * u_n[i]) / length
-        _by_ends(state, x, by, F, late, H_out[a], spare)
+        _by_ends(state, x, by, scale, F, late, H_out[a], spare)
         if x[DIRECTION_AT] >= 0.0:
             z_out[a] += c[int(x[DIRECTION_AT]) + a - 1]
             H_out[a, MOTION + int(x[DIRECTION_AT]) + a - 1] = 1.0

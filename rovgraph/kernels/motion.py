@@ -144,13 +144,14 @@ def _is_on_earth(row: Array) -> bool:
 
 
 @helper
-def _scale_of(row: Array, p: Array, v: Array) -> tuple[float, float, float]:
-    """What a metre along each axis of n changes position by, in the middle of a way at a velocity."""
+def _scale_of(row: Array, p: Array, v: Array) -> tuple[float, float, float, float]:
+    """What a metre along each axis of n changes position by, in the middle of a way; and east by north."""
     if not _is_on_earth(row):
-        return 1.0, 1.0, 1.0
+        return 1.0, 1.0, 1.0, 0.0
     half = 0.5 * row[DURATION]
-    north, east = scales(row[LATITUDE], latitude_at(row[LATITUDE], p[0] + half * v[0]), p[2] + half * v[2])
-    return north, east, 1.0
+    latitude = latitude_at(row[LATITUDE], p[0] + half * v[0])
+    north, east = scales(row[LATITUDE], latitude, p[2] + half * v[2])
+    return north, east, 1.0, east * math.tan(latitude) / radii(row[LATITUDE])[0]
 
 
 @helper
@@ -188,6 +189,7 @@ def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
     kept, R_i, p_i, v_i, bias_i = _kept(row), before.R, before.p, before.v, before.b
     R_j, p_j, v_j, bias_j = after.R, after.p, after.v, after.b
     k = _scale_of(row, p_i, v_i)
+    by_north = row[DURATION] * k[3] * v_i[1]
     roll_pitch_yaw(R_i, known)
     roll_pitch_yaw(R_j, rpy)
     _predict_angles(row, R_i, predicted)
@@ -205,6 +207,9 @@ def coasting_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
             A_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
             A_out[i, AFTER + j] = B_j[i, j]
             A_out[3 + i, 3 + j], A_out[3 + i, AFTER + 3 + j] = -R_i[i, j], R_j[i, j]
+    A_out[4, 6] -= 0.5 * row[DURATION] * by_north
+    for j in range(3):
+        A_out[4, 3 + j] -= by_north * R_i[0, j]
     for i in range(6):
         A_out[9 + i, RESIDUAL] = bias_j[i] - bias_i[i]
 
@@ -221,6 +226,7 @@ def coasting_transition(row: Array, state: Epoch, R_j: Array, F_out: Array, Q_ou
     back[0, 0], back[0, 1], back[0, 2] = 1.0, 0.0, -sp
     back[1, 0], back[1, 1], back[1, 2] = 0.0, cr, sr * cp
     back[2, 0], back[2, 1], back[2, 2] = 0.0, -sr, cr * cp
+    by_north = t * k[3] * state.v[1]
     coasting_covariance(row, Q_out)
     tilt, heading, both = Q_out[0, 0], Q_out[2, 2], Q_out[3, 6]
     for i in range(15):
@@ -231,9 +237,11 @@ def coasting_transition(row: Array, state: Epoch, R_j: Array, F_out: Array, Q_ou
         for j in range(3):
             F_out[i, j] = kept * (back[i, 0] * B[0, j] + back[i, 1] * B[1, j]) + back[i, 2] * B[2, j]
             F_out[3 + i, 3 + j] = R_j[0, i] * R_i[0, j] + R_j[1, i] * R_i[1, j] + R_j[2, i] * R_i[2, j]
+            F_out[3 + i, 3 + j] += by_north * R_j[1, i] * R_i[0, j]
             F_out[3 + i, 6 + j] = t * k[j] * R_j[j, i]
             Q_out[i, j] = tilt * (back[i, 0] * back[j, 0] + back[i, 1] * back[j, 1]) + heading * back[i, 2] * back[j, 2]
             Q_out[3 + i, 6 + j] = Q_out[6 + j, 3 + i] = both * R_j[j, i]
+        F_out[3 + i, 6] += 0.5 * t * by_north * R_j[1, i]
 
 
 @helper
@@ -297,6 +305,10 @@ def cruising_error(row: Array, before: Epoch, after: Epoch, A_out: Array) -> Non
             A_out[3 + i, 3 + j], A_out[3 + i, AFTER + 3 + j] = -R_i[i, j], R_j[i, j]
             A_out[6 + i, j], A_out[6 + i, AFTER + j] = -S[0, i, j], S[1, i, j]
             A_out[6 + i, 6 + j], A_out[6 + i, AFTER + 6 + j] = -R_i[j, i], R_j[j, i]
+    by_north = half * k[3] * (v_i[1] + v_j[1])
+    A_out[4, 6] -= half * by_north
+    for j in range(3):
+        A_out[4, 3 + j] -= by_north * R_i[0, j]
     for i in range(6):
         A_out[9 + i, RESIDUAL] = bias_j[i] - bias_i[i]
 
@@ -319,9 +331,11 @@ def cruising_transition(row: Array, state: Epoch, F_out: Array, Q_out: Array) ->
         for j in range(15):
             F_out[i, j] = 0.0
         F_out[i, i] = 1.0
+    by_north = 2.0 * half * scale[3] * v[1]
     for i in range(3):
         for j in range(3):
-            F_out[3 + i, 6 + j] = 2.0 * half * scale[j] * R[j, i]
+            F_out[3 + i, 3 + j] += by_north * R[1, i] * R[0, j]
+            F_out[3 + i, 6 + j] = 2.0 * half * scale[j] * R[j, i] + (half * by_north * R[1, i] if j == 0 else 0.0)
             across = 0.0  # of u x w, in the body's axes and in n
             across_n = 0.0
             mixed = 0.0

@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pymap3d
 from numpy.typing import NDArray
 
 from rovgraph import compatibility
@@ -40,6 +39,7 @@ from rovgraph.inference.error_state import REINITIALISE_AT_S
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.trajectory import Trajectory
+from rovgraph.live.intake import origin_of
 from rovgraph.live.message import ON_EARTH, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Event
@@ -47,8 +47,9 @@ from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, read_log
 from rovgraph.log.streams import RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
+from rovgraph.model.origin import Origin, north_east
 
-VERSION = 8
+VERSION = 9
 NAME = b"rovgraph checkpoint"
 ARRAY = "$array"
 NUMBERS = "biufc"  # kinds of dtypes: boolean, integer, unsigned, float, complex
@@ -406,7 +407,7 @@ class TrackFile:
         self._on_earth = bool(kept) and kept[0].rstrip().endswith(",lat,lon")
         self._unix = bool(kept) and ",unix_time" in kept[0]
 
-    def add(self, trajectory: Trajectory, origin: tuple[float, float] | None = None) -> None:
+    def add(self, trajectory: Trajectory, origin: Origin | None = None) -> None:
         """Add epochs, later than those before: all of them, or where the disk is full none.
 
         Parameters
@@ -519,14 +520,12 @@ class Files:
             if not file.readline():  # the header alone
                 return None
         if self.replayed or self.state is None:
+            env = self.config.environment
+            env = env.model_copy(update={"frame": self.config.frame_at(env.latitude or 0.0)})  # as `Intake` has it
             # recorded under rovgraph's own names, in SI
-            return replace(
-                read_log(
-                    path, Config(environment=self.config.environment, depth=self.config.depth, sound=self.config.sound)
-                ),
-                config=None,
-            )
-        return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))
+            config = Config(environment=env, depth=self.config.depth, sound=self.config.sound)
+            return replace(read_log(path, config), config=None)
+        return Log.from_frame(_last_rows(path, origin_of(self.state)), source=str(path))
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
@@ -540,7 +539,7 @@ class Files:
         except OSError as error:
             self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
-    def write_smoothed(self, estimate: Estimate, origin: tuple[float, float] | None = None) -> None:
+    def write_smoothed(self, estimate: Estimate, origin: Origin | None = None) -> None:
         """Put a smoothed track on disk, in place of an older one; ``origin`` of `Trajectory.write_csv`."""
         path, partial = self.folder / SMOOTHED, self.folder / f".{SMOOTHED}.partial"
         try:
@@ -619,7 +618,7 @@ class KnownSources(dict[str, float]):
             self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
 
 
-def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
+def _last_rows(path: Path, origin: Origin | None) -> pd.DataFrame:
     """The newest rows of a recording; fixes relative to an origin."""
     with path.open("rb") as file:
         header = file.readline()
@@ -631,5 +630,5 @@ def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
     for of in ("fix", "ship"):
         if origin is not None and f"{of}_lat" in frame and frame[f"{of}_lat"].notna().any():
             lat, lon = (frame.pop(f"{of}_{name}").to_numpy(float) for name in ("lat", "lon"))
-            frame[f"{of}_north"], frame[f"{of}_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+            frame[f"{of}_north"], frame[f"{of}_east"] = north_east(lat, lon, origin)
     return frame

@@ -6,12 +6,11 @@ its initial conditions. Sensors that begin later join: the filter continues with
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pymap3d
 
 from rovgraph.diagnosis.check.values import angles, gravity, turn_rates
 from rovgraph.errors import InputError
@@ -23,6 +22,7 @@ from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, label_number, precedence
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, Mag
+from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
@@ -45,17 +45,17 @@ class _Patch(NamedTuple):
     latitude, longitude : of the point, and by a metre north, and east [deg]
     """
 
-    origin: tuple[float, float]
+    origin: Origin
     north: float
     east: float
     latitude: tuple[float, float, float]
     longitude: tuple[float, float, float]
 
     @staticmethod
-    def around(north: float, east: float, origin: tuple[float, float]) -> "_Patch":
+    def around(north: float, east: float, origin: Origin) -> "_Patch":
         """The patch of a point."""
         ahead, aside = np.array([0.0, PATCH_M, -PATCH_M, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, PATCH_M, -PATCH_M])
-        found = np.array(pymap3d.ned2geodetic(north + ahead, east + aside, 0.0, *origin, 0.0)[:2])
+        found = np.array(lat_lon(north + ahead, east + aside, origin))
         away = (found - found[:, :1] + 180.0) % 360.0 - 180.0  # longitudes leap at the date line
         by_north, by_east = away[:, 1] - away[:, 2], away[:, 3] - away[:, 4]
         latitude, longitude = np.column_stack([found[:, 0], np.column_stack([by_north, by_east]) / (2.0 * PATCH_M)])
@@ -79,11 +79,16 @@ class Intake:
     Attributes
     ----------
     origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
+    frame : of a dive that has begun
     news : (sensor, text) to be reported, since they were last taken
     """
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
-        self.origin = config.environment.origin
+        self.config = config
+        self.frame: Frame | None = None
+        self.origin: Origin | None = None
+        if (stated := config.environment.origin) is not None:
+            self.origin = origin_in(config.frame_at(stated[0]), *stated)
         self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._sound, self._water = SoundCorrection(config), np.full(3, np.nan)  # in the order of `WaterState`
@@ -116,8 +121,9 @@ class Intake:
             sensor, values = "depth", np.array([below])
         if sensor in ON_EARTH:
             if self.origin is None:
-                self.origin = float(values[0]), float(values[1])
-            north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
+                lat, lon = float(values[0]), float(values[1])
+                self.origin = origin_in(self.frame or self.config.frame_at(lat), lat, lon)
+            north, east = north_east(values[0], values[1], self.origin)
             sensor, values = _STREAM[sensor], np.array([north, east, values[2]])
         elif sensor == "fix":
             self._local = True
@@ -242,8 +248,17 @@ class Intake:
         return patch.at(north, east)
 
 
+def origin_of(state: Mapping[str, Any]) -> Origin | None:
+    """The origin in a checkpoint."""
+    return None if state["origin"] is None else origin_in(state["frame"], *state["origin"])
+
+
 MARGIN_S = 0.5  # beyond the window, for data that come late
 AGAIN_S = 1.0  # between attempts
+NEEDS_ORIGIN = (
+    "environment.frame: earth needs a fix in latitude and longitude before the dive begins, or environment."
+    "origin_lat_deg and origin_lon_deg"
+)
 NEEDS_IMU = "online needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z"
 
 
@@ -265,10 +280,6 @@ class Startup:
     _next: float | None = None
 
     def __post_init__(self) -> None:
-        if self.config.environment.frame == "earth":
-            raise InputError(
-                "environment.frame: earth is for recorded logs; state flat, and smooth the recording in it"
-            )
         if has_constant_velocity(self.config):
             raise InputError(f"motion.model: constant_velocity is for recorded logs, {NEEDS_IMU}")
 
@@ -281,7 +292,7 @@ class Startup:
             return "no measurement of an IMU yet"
         return f"the first {WINDOW_S + MARGIN_S:g} s of the IMU go by"
 
-    def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> InitialConditions | None:
+    def add(self, measurement: Measurement, origin: Origin | None) -> InitialConditions | None:
         """Take a measurement; the beginning of the dive, once it is known.
 
         Parameters
@@ -299,7 +310,7 @@ class Startup:
         self._next = measurement.time + AGAIN_S
         return self.begin(origin)
 
-    def begin(self, origin: tuple[float, float] | None) -> InitialConditions | None:
+    def begin(self, origin: Origin | None) -> InitialConditions | None:
         """The beginning from what is there, or None; then `waits_for` has the reason."""
         self.measurements.sort(key=lambda m: (m.time, precedence(m.sensor)))
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
@@ -314,9 +325,14 @@ class Startup:
         unstated = {name for name, section in sections.items() if section == type(section)()}  # as a whole file has it
         later = [s for s in later if s.name not in unstated]
         expected = {s.name for s in later if s.heading_source is None or named}
-        log = gathered(self.measurements, "so far", origin)
+        log, config = gathered(self.measurements, "so far", origin), self.config
+        if origin is None and config.environment.frame == "earth":
+            self.waits_for = NEEDS_ORIGIN
+            return None
+        if origin is None:
+            config = config.model_copy(update={"environment": config.environment.model_copy(update={"frame": "flat"})})
         try:
-            initial = initialise(log, self.config, expected)
+            initial = initialise(log, config, expected)
         except InputError as error:
             self.waits_for = str(error)
             return None

@@ -14,6 +14,7 @@ import numpy as np
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
+from rovgraph.model.origin import Origin
 
 MARKS = "marks.csv"
 MOST_MARKS = 500  # that pages may drop: the whole file is written at each
@@ -114,7 +115,7 @@ def write_marks(path: Path, marks: Sequence[Mark]) -> None:
         table.writerows(asdict(mark) for mark in marks)
 
 
-def marks_beside(recording: Path, track: Trajectory, origin: tuple[float, float] | None = None) -> tuple[Mark, ...]:
+def marks_beside(recording: Path, track: Trajectory, origin: Origin | None = None) -> tuple[Mark, ...]:
     """The marks that were dropped while a recording was made, those of the vehicle where a better track has it then.
 
     Parameters

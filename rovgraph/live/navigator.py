@@ -21,7 +21,7 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, unlocated
+from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
@@ -29,6 +29,7 @@ from rovgraph.live.solution import BeaconPlace, Event, RangeCircle, SensorHealth
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT, MOUNT, TABLE, beacon_names
 from rovgraph.model.config import Config
+from rovgraph.model.origin import Origin, flat_error, outgrows_plane
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
@@ -96,10 +97,11 @@ class Navigator:
         self._sounded: Measurement | None = None  # newest ranges, or altitude
         self._bottom: Bottom | None = None  # that these show, once a solution has placed them
         self._beam_seen: dict[str, float] = {}  # when each was valid last [s]
+        self._outgrown = False  # the plane, which has been said
         self._located = self.config.start.located  # where the fixes count from
 
     @property
-    def origin(self) -> tuple[float, float] | None:
+    def origin(self) -> Origin | None:
         """Latitude and longitude [deg] of north = east = 0, where they are known."""
         return self._intake.origin
 
@@ -228,6 +230,7 @@ class Navigator:
             cov_north_east=float(t.cov_p[0, 0, 1]),
             latitude=latitude,
             longitude=longitude,
+            origin=self.origin,
             calibration=self._calibration(engine, known),
             sensors=self._sensors(),
             events=self._take_events(),
@@ -250,6 +253,7 @@ class Navigator:
             "engine": self.engine.state(),
             "clocks": self.clocks.state(),
             "origin": self.origin,
+            "frame": self._intake.frame,
             "travelled": [self._distance, *self._here.tolist()],
             "used": dict(self.health.used),
             "rejected": dict(self.health.rejected),
@@ -260,7 +264,7 @@ class Navigator:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from the state of another; the filter is not reinitialised any more."""
-        self._intake.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
+        self._intake.origin = origin_of(state)
         self.close()
         self._reinitialisations = None
         self._begin(restored(state["beginning"]), state["engine"])
@@ -269,8 +273,7 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
-        if "surface" in state:  # not of an earlier version
-            self._intake.pressure.surface.restore(state["surface"].tolist())
+        self._intake.pressure.surface.restore(state["surface"].tolist())
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
@@ -306,6 +309,7 @@ class Navigator:
     def _begin(self, initial: InitialConditions, state: Mapping[str, Any] | None = None) -> None:
         """The first seconds are over, or an estimate continues from its state."""
         config = initial.config
+        self._intake.frame = "earth" if config.environment.frame == "earth" else "flat"
         if self.smooth:
             from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
@@ -508,4 +512,20 @@ class Navigator:
         if not step < 1.0:
             self._distance += step if np.isfinite(step) else 0.0
             self._here = p_n
+            self._watch_plane(math.hypot(p_n[0], p_n[1]))
         return self._distance
+
+    def _watch_plane(self, away: float) -> None:
+        """Report once that a plane which was not stated is wrong by now, ``away`` from its origin [m]."""
+        if self._outgrown or self.origin is None or self.config.environment.frame != "auto":
+            return
+        latitude = self.origin[0]
+        if self._intake.frame == "flat" and outgrows_plane(latitude, away, away):
+            self._outgrown = True
+            off = flat_error(latitude, away)
+            self.say(
+                "origin",
+                "warning",
+                f"{away / 1e3:.1f} km from the origin a flat frame is wrong by {off:.0f} m; state environment.frame: "
+                "earth before the next dive",
+            )

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from rovgraph.diagnosis.alarm import Alarm, Verdict
 from rovgraph.geometry import Array
+from rovgraph.model.origin import Origin
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class Solution:
     cov_north_east : [m^2]
     rpy, rpy_sd : ndarray, shape (3,), roll, pitch, yaw [rad]
     latitude, longitude : [deg], None without an origin
+    origin : of north and east
     calibration : label -> (value, sd), radians and SI
     sensors : name of the stream -> SensorHealth
     events : since the last solution
@@ -114,6 +116,7 @@ class Solution:
     cov_north_east: float
     latitude: float | None = None
     longitude: float | None = None
+    origin: Origin | None = None
     calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     sensors: Mapping[str, SensorHealth] = field(default_factory=dict)
     events: tuple[Event, ...] = ()

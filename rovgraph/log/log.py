@@ -16,6 +16,7 @@ from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
 from rovgraph.model.config import Config, config_or_defaults
+from rovgraph.model.origin import Origin
 from rovgraph.sensors.dvl_beam import BEAMS
 
 
@@ -37,7 +38,7 @@ class Log:
 
     source: str
     streams: Mapping[str, Stream]
-    origin: tuple[float, float] | None = None
+    origin: Origin | None = None
     config: Config | None = None
     warnings: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -213,8 +214,9 @@ class Log:
         """
         if self.config is None:
             return
-        tables = "columns", "units", "angles", "times", "files", "delay_s"
-        for key in (*tables, "imu.mag", "environment.origin", "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
+        tables = "columns", "units", "angles", "times", "files", "delay_s", "imu.mag"
+        place = "environment.origin", "environment.frame"
+        for key in (*tables, *place, "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
                     f"{self.source}: was read with another value of {key} than the configuration has; "
@@ -275,7 +277,7 @@ def _entry(config: Config, key: str) -> object:
     return entry
 
 
-def gathered(measurements: Iterable[Measurement], source: str, origin: tuple[float, float] | None = None) -> Log:
+def gathered(measurements: Iterable[Measurement], source: str, origin: Origin | None = None) -> Log:
     """A log of measurements in the order of time: the inverse of `Log.measurements`."""
     rows: dict[str, list[Measurement]] = {}
     for m in measurements:

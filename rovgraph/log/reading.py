@@ -43,8 +43,7 @@ from rovgraph.log.units import (
     turn_angles,
 )
 from rovgraph.model.config import Config, TableSettings
-from rovgraph.model.config_sections import Environment
-from rovgraph.model.origin import EarthOrigin, north_east, origin_in
+from rovgraph.model.origin import EarthOrigin, Origin, north_east, origin_in
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
@@ -52,19 +51,16 @@ from rovgraph.sensors.pressure import PRESSURE, complaints, depths
 from rovgraph.sensors.water_layer import CELLS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
-FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
+FARTHEST = {"flat": 100e3, "auto": 1000e3, "earth": np.inf}  # of fixes from an origin: that far it is a mistake [m]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
 
 Bools = NDArray[np.bool_]
 Lines = NDArray[np.int64]
 
 
-Origin = tuple[float, float] | None  # latitude and longitude [deg] of north = east = 0
-
-
 def read_streams(
     tables: Iterable[Table], config: Config, source: str, notes: list[str] | None = None
-) -> tuple[dict[str, Stream], Origin]:
+) -> tuple[dict[str, Stream], Origin | None]:
     """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
     Parameters
@@ -86,13 +82,15 @@ def read_streams(
     -----
     DataWarning : what was left out or sorted
     """
-    origin = config.environment.origin
     found: dict[str, Stream] = {}
     names: dict[str, None] = {}
-    for table in tables:
+    parts = [(table, *_cells(table, config)) for table in tables]
+    for table, cells, line in parts:
         names |= dict.fromkeys(table.names)
-        streams, origin = _streams(table, config, origin)
-        found |= streams
+        _check_positions(cells, line, table.source)
+    origin = _origin(config, [cells for _, cells, _ in parts], source)
+    for table, cells, line in parts:
+        found |= _streams(table, cells, line, origin)
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
     _add_depth(found, config, origin, source, [] if notes is None else notes)
@@ -105,7 +103,7 @@ def read_streams(
     return found | with_sound_speed(found, found, config), origin
 
 
-def _add_depth(found: dict[str, Stream], config: Config, origin: Origin, source: str, notes: list[str]) -> None:
+def _add_depth(found: dict[str, Stream], config: Config, origin: Origin | None, source: str, notes: list[str]) -> None:
     """Turn pressures into depths, or leave them out beside depths.
 
     Raises
@@ -179,16 +177,20 @@ def delay_of(config: Config, sensor: str) -> float:
     return delays.get(sensor, delays.get("dvl", 0.0) if sensor in (BEAMS, CELLS) else 0.0)
 
 
-def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, Stream], Origin]:
-    """The streams of one table as they stand in it, and the origin, which is its first fix where it was not known."""
+def _cells(table: Table, config: Config) -> tuple[dict[str, Array], Lines]:
+    """The columns of one table that are no empty ones, in the order of time, and their lines."""
     cells, _ = read_columns(table, config.table)
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
-    cells, line = in_order(cells, table.line, table.source, RECEIVED in table.names)
-    origin = _add_local_fixes(cells, line, table.source, origin, config.environment)
+    return in_order(cells, table.line, table.source, RECEIVED in table.names)
+
+
+def _streams(table: Table, cells: dict[str, Array], line: Lines, origin: Origin | None) -> dict[str, Stream]:
+    """The streams of one table as they stand in it."""
+    _add_local_fixes(cells, origin)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
     streams += [_thruster(cells, line, table.source)]
-    return {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}, origin
+    return {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}
 
 
 def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array], dict[str, str]]:
@@ -351,42 +353,77 @@ def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool
     return {name: values[order] for name, values in cells.items()}, line[order]
 
 
-def _add_local_fixes(
-    cells: dict[str, Array], line: Lines, source: str, origin: Origin, environment: Environment
-) -> tuple[float, float] | None:
-    """Turn latitude and longitude of fixes and of the ship into north and east.
+VELOCITY = {"dvl_vx", "dvl_vy", "dvl_vz"}
+FASTEST = 10.0  # of any vehicle below water [m/s]
+PLACES = "fix", "ship"  # that may come in latitude and longitude
 
-    Returns
-    -------
-    origin : latitude and longitude [deg], as stated or of the first fix, else of the ship's first position; or None
+
+def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
+    """Leave out latitudes and longitudes that are none, and those beside which there are north and east.
 
     Raises
     ------
-    InputError : no angles in degrees; further from a stated origin than a flat frame reaches
+    InputError : no angles in degrees
     """
-    for of, what in (("fix", "fixes"), ("ship", "the ship's positions")):
+    for of in PLACES:
         lat_lon, local = (f"{of}_lat", f"{of}_lon"), (f"{of}_north", f"{of}_east")
         if not all(name in cells for name in lat_lon):
             continue
         if all(name in cells for name in local):
             warn(f"{source}: {lat_lon[0]} and {lat_lon[1]} are ignored beside {local[0]} and {local[1]}")
+            del cells[lat_lon[0]], cells[lat_lon[1]]
             continue
-        lat, lon = valid_positions(cells.pop(lat_lon[0]), cells.pop(lat_lon[1]), line, source)
-        valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
-        cells[local[0]], cells[local[1]] = lat * np.nan, lon * np.nan
-        if not valid.size:
-            continue
-        origin = origin_in(environment.frame, float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
-        north, east = north_east(lat[valid], lon[valid], origin)
-        away = float(np.median(np.hypot(north, east)))
-        if away > FARTHEST and not isinstance(origin, EarthOrigin):
-            raise InputError(
-                f"{source}: {what} lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
-                f"{origin[0]:g}, {origin[1]:g}; correct them, remove these keys to use the first fix, "
-                "or state environment.frame: earth"
-            )
-        cells[local[0]][valid], cells[local[1]][valid] = north, east
-    return origin
+        lat, lon = valid_positions(cells[lat_lon[0]], cells[lat_lon[1]], line, source)
+        known = ~np.isnan(lat) & ~np.isnan(lon)
+        cells[lat_lon[0]], cells[lat_lon[1]] = np.where(known, lat, np.nan), np.where(known, lon, np.nan)
+
+
+def _origin(config: Config, parts: Sequence[dict[str, Array]], source: str) -> Origin | None:
+    """The origin as stated or of the first fix, else of the ship's first position, in the frame of the dive.
+
+    Raises
+    ------
+    InputError : positions are further from it than its frame reaches
+    """
+    names = [(f"{of}_lat", f"{of}_lon") for of in PLACES]
+    seen = [np.column_stack([cells[n] for n in pair]) for pair in names for cells in parts if {*pair} <= {*cells}]
+    places, stated = np.vstack([np.empty((0, 2)), *seen]), config.environment.origin
+    places = places[~np.isnan(places[:, 0])]
+    if stated is None and not len(places):
+        return None
+    lat, lon = places[0].tolist() if stated is None else stated
+    north, east = north_east(places[:, 0], places[:, 1], EarthOrigin(lat, lon))
+    away = float(np.median(np.hypot(north, east))) if len(places) else 0.0
+    way = 0.0
+    for cells in parts:
+        if {*cells} >= VELOCITY and "fix_north" not in cells:  # which is of a plane
+            way = max(way, length_of_way(cells["time"], np.column_stack([cells[name] for name in sorted(VELOCITY)])))
+    frame = config.frame_at(lat, away, way)
+    if away > FARTHEST["flat" if frame == "flat" else config.environment.frame]:
+        raise InputError(
+            f"{source}: fixes lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = {lat:g}, "
+            f"{lon:g}; correct them, remove these keys to use the first fix, or state environment.frame: earth"
+        )
+    return origin_in(frame, lat, lon)
+
+
+def length_of_way(time: Array, velocity: Array) -> float:
+    """How far a DVL has gone at its mean speed [m], shapes (n,), (n, 3); NaN = no bottom lock, and as fast as between.
+
+    >>> length_of_way(np.arange(101.0), np.tile([2.0, 0.0, 0.0], (101, 1)))
+    200.0
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    known = speed < FASTEST
+    return float(np.mean(speed[known]) * np.ptp(time[known])) if known.any() else 0.0
+
+
+def _add_local_fixes(cells: dict[str, Array], origin: Origin | None) -> None:
+    """Turn latitude and longitude of fixes and of the ship into north and east."""
+    for of in PLACES:
+        if origin is not None and {f"{of}_lat", f"{of}_lon"} <= {*cells}:
+            lat_lon = cells.pop(f"{of}_lat"), cells.pop(f"{of}_lon")
+            cells[f"{of}_north"], cells[f"{of}_east"] = north_east(*lat_lon, origin)
 
 
 def _select(

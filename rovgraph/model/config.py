@@ -85,6 +85,7 @@ from rovgraph.model.config_sections import (
     Water,
 )
 from rovgraph.model.gauss_markov import stationary_walk
+from rovgraph.model.origin import Frame, outgrows_plane
 from rovgraph.model.presets import with_presets, without_presets
 
 ALIGNED = 1.0 / 3.0  # of a mounting's sd, where the replies are in the ship's axes or north-aligned
@@ -268,6 +269,9 @@ def _rebuild(section: type[BaseModel]) -> None:
 Model = TypeVar("Model", bound=BaseModel)
 
 
+GOOD_GYRO_DPS = 0.1 / 3600.0  # sd of a bias beside which the transport rate counts
+
+
 class Config(ConfigSection):
     """What an estimator believes; see docs/configuration.md for all keys."""
 
@@ -387,6 +391,22 @@ class Config(ConfigSection):
         """
         stated = without_presets(self.model_dump(exclude_unset=True), keys)
         return _parse_config(merged(stated, keys), "changed")
+
+    def frame_at(self, latitude: float | None, away: float = 0.0, way: float = 0.0) -> Frame:
+        """The frame of a dive, as stated or chosen.
+
+        Parameters
+        ----------
+        latitude : of its origin, None where it is not known [deg]
+        away, way : how far from the origin it is seen, and how far it goes [m]
+        """
+        env = self.environment
+        if env.frame != "auto":
+            return env.frame
+        if latitude is None or env.earth_rotation is False or not env.has_latitude(latitude):
+            return "flat"
+        good = self.imu.gyr_bias_sd_dps <= GOOD_GYRO_DPS
+        return "earth" if good or outgrows_plane(latitude, away, way) else "flat"
 
     def with_raw_magnetometer(self) -> "Config":
         """The same without a calibration of the magnetometer: its samples are what they are."""

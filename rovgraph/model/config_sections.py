@@ -87,9 +87,10 @@ class Environment(ConfigSection):
     latitude_deg: Latitude | None = Field(
         None, description="latitude, for gravity and Earth rotation; null = of the origin"
     )
-    frame: Literal["flat", "earth"] = Field(
-        "flat",
-        description="north and east on a plane, or as latitude and longitude on WGS 84 at the origin's scale (earth)",
+    frame: Literal["flat", "earth", "auto"] = Field(
+        "auto",
+        description="north and east on a plane (flat), or as latitude and longitude on WGS 84 at the origin's scale "
+        "(earth); auto = earth where the latitude is known and the way is too long for a plane, or the gyro is good",
     )
     declination_deg: float = Field(
         0.0,
@@ -102,7 +103,9 @@ class Environment(ConfigSection):
     dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
         None, description="dip of the field, down positive; null = from the log, against gravity"
     )
-    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros measure")
+    earth_rotation: bool | None = Field(
+        None, description="model the Earth's rotation, which good gyros measure; null = in frame earth only"
+    )
 
     @model_validator(mode="after")
     def _whole_origin(self) -> Self:
@@ -130,18 +133,20 @@ class Environment(ConfigSection):
         lat, lon = self.origin_lat_deg, self.origin_lon_deg
         return None if lat is None or lon is None else origin_in(self.frame, lat, lon)
 
-    @property
-    def earth_latitude(self) -> float:
-        """Latitude of the origin of frame "earth" [rad]; NaN in a flat one."""
-        if self.frame != "earth":
-            return np.nan
-        lat = self.latitude_deg if self.origin_lat_deg is None else self.origin_lat_deg
-        return np.nan if lat is None else float(np.deg2rad(lat))
+    def has_latitude(self, latitude: float) -> bool:
+        """Whether an origin at a latitude [deg] can be that of frame "earth", beside what is stated."""
+        stated = latitude if self.latitude_deg is None else self.latitude_deg
+        return abs(latitude) <= HIGHEST_LATITUDE_DEG and abs(stated - latitude) <= SAME_LATITUDE_DEG
 
     @property
     def latitude(self) -> float | None:
-        """Latitude [deg], as stated or of a stated origin."""
+        """Latitude [deg], as stated or of a stated origin; once the environment of a dive is resolved, the origin's."""
         return self.origin_lat_deg if self.latitude_deg is None else self.latitude_deg
+
+    @property
+    def earth_latitude(self) -> float:
+        """Latitude of the origin of frame "earth" [rad]; NaN in a flat one."""
+        return np.nan if self.frame != "earth" or self.latitude is None else float(np.deg2rad(self.latitude))
 
     @property
     def gravity(self) -> float:

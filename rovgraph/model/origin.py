@@ -29,11 +29,29 @@ class EarthOrigin(NamedTuple):
 
 
 Origin = tuple[float, float] | EarthOrigin
+Frame = Literal["flat", "earth"]
+DRIFT, OF_DRIFT = 0.005, 0.1  # expected, of the way; share of it by which a plane may be wrong
 
 
-def origin_in(frame: Literal["flat", "earth"], lat: float, lon: float) -> Origin:
-    """An origin of a frame."""
+def origin_in(frame: str, lat: float, lon: float) -> Origin:
+    """An origin of a frame; of "auto" that of a flat one."""
     return EarthOrigin(lat, lon) if frame == "earth" else (lat, lon)
+
+
+def frame_of(origin: Origin) -> Frame:
+    """The frame whose origin it is."""
+    return "earth" if isinstance(origin, EarthOrigin) else "flat"
+
+
+def flat_error(latitude: float, metres: float) -> float:
+    """By how much a plane is wrong at a distance from the origin, whose latitude is in degrees [m]."""
+    at = np.deg2rad(latitude)
+    return float(metres**2 * abs(np.tan(at)) / (2.0 * radii(at)[1]))
+
+
+def outgrows_plane(latitude: float, away: float, way: float) -> bool:
+    """Whether a plane is wrong by a tenth of the drift of a way, somewhere along it or up to ``away`` [m]."""
+    return flat_error(latitude, max(away, way)) > OF_DRIFT * DRIFT * max(away, way)
 
 
 def north_east(lat: ArrayLike, lon: ArrayLike, origin: Origin) -> tuple[Array, Array]:

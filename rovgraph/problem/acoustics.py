@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy, rotate, rpy_axes, transpose, wrap_angle
 from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.earth import latitude_at, scales
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import label_number
 from rovgraph.model.calibration import LAYOUT, USBL_MOUNT, beacon_names
@@ -279,6 +280,7 @@ class Acoustics:
         context[:, at.ARM : at.ARM + 3] = instrument.model.arm_b
         context[:, at.SEEN : at.SEEN + 3] = seen
         context[:, at.STATED], context[:, at.SINCE] = late, stream.time - begin
+        context[:, at.ORIGIN] = self.config.environment.earth_latitude
         context[:, at.WAYS] = 1.0 if settings.one_way else 2.0
         on_vehicle = sensor == "range" or self.config.usbl.head == "vehicle"
         if settings.stamp == "transponder":  # when the transponder heard the question, on the ship's or the vehicle's
@@ -421,7 +423,7 @@ class Acoustics:
             place = np.column_stack([pose.p, np.zeros(n)])
             antenna = rotate(R_ns, np.broadcast_to(np.array(self.config.ship.antenna_m), (n, 3)))
             antenna[:, 2] = 0.0  # heights count from the waterline
-            context[:, part : part + 3] = place - antenna + rotate(R_ns, arms)
+            context[:, part : part + 3] = place + scale_at(self.config, place) * (rotate(R_ns, arms) - antenna)
             why.append(("without a position of the ship", on_ship & np.isnan(pose.p).any(axis=1)))
             if heading:
                 why.append(("without a heading of the ship", on_ship & np.isnan(pose.rpy[:, 2])))
@@ -590,6 +592,14 @@ class Acoustics:
             signal.values = np.array(state[f"{sensor}_values"], float).reshape(-1, signal.width)
 
 
+def scale_at(config: Config, p_n: Array) -> Array:
+    """What a metre changes north, east and down by at some places, shape (k, 3)."""
+    out, latitude = np.ones_like(p_n), config.environment.earth_latitude
+    if not math.isnan(latitude):
+        out[:, :2] = np.column_stack(scales(latitude, latitude_at(latitude, p_n[:, 0]), p_n[:, 2]))
+    return out
+
+
 class Sightings(NamedTuple):
     """Where acoustic directions and ranges put the vehicle by themselves, by the head's nominal mounting.
 
@@ -618,7 +628,8 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     z, sd, x = stream.data[:, :3], stream.data[:, 3:6], stream.data[:, 6 : 6 + at.WIDTH]
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
     head = x[:, at.HEARD : at.HEARD + 3]
-    p = head + rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
+    way = rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
+    p = head + scale_at(config, head + 0.5 * way) * way
     across = z[:, 0] * np.max(
         np.where(sd[:, 1:] < LARGEST_SD, sd[:, 1:], 0.0), axis=1
     )  # a depth that is given is known

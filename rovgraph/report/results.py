@@ -262,6 +262,7 @@ def summarise(
         "log": log.source,
         "verdict": verdict_of(alarms),
         **{name: [_alarm_numbers(a, main.trajectory.time[0]) for a in some] for name, some in _parted(alarms).items()},
+        "frame": config.environment.frame,
         "origin": None if log.origin is None else {"lat_deg": log.origin[0], "lon_deg": log.origin[1]},
         "start_time_s": main.trajectory.time[0],
         "main_estimate": main.kind,

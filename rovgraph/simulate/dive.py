@@ -25,9 +25,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, earth_rate_n, rotate, rpy_from_matrix, transpose, wrap_angle
+from rovgraph.geometry import EARTH_RATE, Array, rotate, rpy_from_matrix, transpose, wrap_angle
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, latitude_at, normal_gravity, radii
 from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS
 from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
 from rovgraph.model.state import State
@@ -41,21 +42,42 @@ from rovgraph.simulate.path import Motion, Path
 from rovgraph.simulate.truth import Truth, correlated, of_waves, remembered
 
 
-def _earth_rate(config: Config) -> Array:
-    """Rate of the Earth in n, shape (3,) [rad/s]; zero where it is not modelled.
+def in_frame(path: Path, truth: Truth) -> tuple[Path, Truth]:
+    """A path and its truth in the frame that is stated, or chosen as for the log of the dive."""
+    config, env = truth.config, truth.config.environment
+    steps = np.diff(path.motion(np.linspace(0.0, path.duration, 1000)).p_n, axis=0)
+    way = float(np.linalg.norm(steps, axis=1).sum()) if truth.fix_interval is None else 0.0
+    env = env.model_copy(update={"frame": config.frame_at(env.latitude, way=way)})
+    truth = replace(truth, config=config.model_copy(update={"environment": env}))
+    return replace(path, latitude=env.earth_latitude), truth
+
+
+def _turning(motion: Motion, config: Config) -> tuple[Array, Array, Array]:
+    """Rate of the Earth and of the axes of n [rad/s], and gravity [m/s^2], in n, shape (n, 3) each.
 
     Raises
     ------
-    InputError : modelled, but the latitude is not known
+    InputError : the Earth's rotation or frame is modelled, but the latitude is not known
     """
     env = config.environment
+    w_ie, w_in, g_n = (np.zeros((len(motion), 3)) for _ in range(3))
+    g_n[:, 2] = env.gravity_at(motion.p_n[:, 2])
+    if env.latitude is None and (env.earth_rotation or env.frame == "earth"):
+        modelled = "frame: earth" if env.frame == "earth" else "earth_rotation"
+        raise InputError(f"environment.{modelled} needs environment.latitude_deg")
+    if env.latitude is None:
+        return w_ie, w_in, g_n
+    latitude = np.full(len(motion), np.deg2rad(env.latitude))
     if env.frame == "earth":
-        raise InputError("dives are simulated in environment.frame: flat; state that")
-    if not env.earth_rotation:
-        return np.zeros(3)
-    if env.latitude_deg is None:
-        raise InputError("environment.earth_rotation needs environment.latitude_deg")
-    return earth_rate_n(float(np.deg2rad(env.latitude_deg)))
+        latitude = latitude_at(env.earth_latitude, motion.p_n[:, 0])
+        M, N = radii(latitude)
+        north, east = motion.v_n[:, 0] / (M - motion.p_n[:, 2]), motion.v_n[:, 1] / (N - motion.p_n[:, 2])
+        w_in = np.column_stack([east, -north, -east * np.tan(latitude)])
+        g_n[:, 2] = env.gravity + normal_gravity(latitude) - normal_gravity(env.earth_latitude)
+        g_n[:, 2] += GRAVITY_PER_DEPTH * motion.p_n[:, 2]
+    if env.frame == "earth" or env.earth_rotation:
+        w_ie = EARTH_RATE * np.column_stack([np.cos(latitude), np.zeros(len(motion)), -np.sin(latitude)])
+    return w_ie, w_ie + w_in, g_n
 
 
 def specific_force_and_rate(motion: Motion, config: Config) -> Array:
@@ -71,14 +93,13 @@ def specific_force_and_rate(motion: Motion, config: Config) -> Array:
     ndarray, shape (n, 6), specific force [m/s^2], angular rate [rad/s]
     """
     arm = np.asarray(config.imu.lever_arm_m, float)
-    w_ie_n, g_n = _earth_rate(config), np.zeros((len(motion.p_n), 3))
-    g_n[:, 2] = config.environment.gravity_at(motion.p_n[:, 2])
+    w_ie_n, w_in_n, g_n = _turning(motion, config)
     R_bn = transpose(motion.R_nb)
-    w_ie_b = rotate(R_bn, w_ie_n)
+    w_in_b = rotate(R_bn, w_in_n)
     swing = np.cross(motion.w_b, arm)
-    f_b = rotate(R_bn, motion.a_n + 2.0 * np.cross(w_ie_n, motion.v_n) - g_n)
-    f_b += np.cross(motion.alpha_b, arm) + np.cross(motion.w_b, swing) + 2.0 * np.cross(w_ie_b, swing)
-    return np.hstack([f_b, motion.w_b + w_ie_b])
+    f_b = rotate(R_bn, motion.a_n + np.cross(w_ie_n + w_in_n, motion.v_n) - g_n)
+    f_b += np.cross(motion.alpha_b, arm) + np.cross(motion.w_b, swing) + 2.0 * np.cross(w_in_b, swing)
+    return np.hstack([f_b, motion.w_b + w_in_b])
 
 
 def walk(start: Array, noise: ImuNoise, rate: float, n: int, rng: np.random.Generator) -> Array:
@@ -204,7 +225,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     calibration = truth.draw_calibration(rng)
     lasting = draw_lasting(truth, calibration, path.duration, rng)
     bias_start, offset = truth.draw_bias(rng), truth.draw_start(rng)
-    path = path.shifted(offset)
+    path, truth = in_frame(path.shifted(offset), truth)
     time = np.round(np.arange(int(path.duration * truth.imu_rate + 1e-6) + 1) / truth.imu_rate, 4)
     motion = path.motion(time)
     bias = np.broadcast_to(bias_start, (len(time), 6))

@@ -6,6 +6,7 @@ estimator; ``summary.json`` lists the options.
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,10 @@ def known(dive: Dive, config: Config) -> Config:
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
     recorded = with_priors_stated(config.as_recorded())
-    return recorded.model_copy(update={"start": start, "columns": {}, "units": {}})
+    env = config.environment
+    if not math.isnan(dive.path.latitude):
+        env = env.model_copy(update={"frame": "earth"})
+    return recorded.model_copy(update={"start": start, "environment": env, "columns": {}, "units": {}})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

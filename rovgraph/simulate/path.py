@@ -11,6 +11,7 @@ angular rate and angular acceleration are their exact derivatives. With the Eule
 and the angular acceleration its derivative. A route is a list of points to pass, which becomes a path in time.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.kernels.earth import latitude_at, radii, scales
 
 
 @dataclass(frozen=True)
@@ -189,12 +191,14 @@ class Path:
     duration : [s]
     offset_n : ndarray, shape (3,), added to the spline's positions [m]
     thrusters : what drove it, None = nothing did, it is a motion as such
+    latitude : of the origin of frame "earth", in which positions are angles at its scale [rad]; NaN = n is flat
     """
 
     spline: BSpline
     duration: float
     offset_n: Array = field(default_factory=lambda: np.zeros(3))
     thrusters: Thrusters | None = None
+    latitude: float = math.nan
 
     @staticmethod
     def through(time: Array, p_n: Array, rpy: Array, rest: bool = True, thrusters: Thrusters | None = None) -> "Path":
@@ -223,8 +227,15 @@ class Path:
         x, first, second = (self.spline(t, nu) for nu in range(3))
         rpy = x[:, 3:]
         w_b, alpha_b = body_rates(rpy, first[:, 3:], second[:, 3:])
-        p_n = x[:, :3] + self.offset_n
-        return Motion(t, matrix_from_rpy(rpy), p_n, first[:, :3], second[:, :3], w_b, alpha_b)
+        p_n, v_n, a_n = x[:, :3] + self.offset_n, first[:, :3], second[:, :3]
+        if not math.isnan(self.latitude):
+            latitude = latitude_at(self.latitude, p_n[:, 0])
+            north, east = scales(self.latitude, latitude, p_n[:, 2])
+            v_n = v_n / np.column_stack([north, east, np.ones(len(t))])
+            M, N = radii(latitude)
+            grows = np.column_stack([v_n[:, 2] / M, v_n[:, 2] / N + v_n[:, 0] * np.tan(latitude) / M, 0.0 * t])
+            a_n = a_n / np.column_stack([north, east, np.ones(len(t))]) - grows * v_n
+        return Motion(t, matrix_from_rpy(rpy), p_n, v_n, a_n, w_b, alpha_b)
 
 
 def body_rates(rpy: Array, first: Array, second: Array) -> tuple[Array, Array]:

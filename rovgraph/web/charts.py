@@ -9,12 +9,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pymap3d
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
@@ -22,6 +22,7 @@ from starlette.routing import BaseRoute, Route
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.live.solution import Solution
+from rovgraph.model.origin import north_east
 
 LARGEST_PIXELS = 2048  # of a side, as it is shown
 MOST_VERTICES = 200_000
@@ -103,7 +104,8 @@ class Charts:
         """``/api/charts`` and the images."""
 
         async def listed(request: Request) -> Response:
-            place = _place(newest())
+            origin = None if (solution := newest()) is None else solution.origin
+            place = None if origin is None else partial(north_east, origin=origin)
             charts = [{"number": k, "name": c.name, "kind": c.kind} for k, c in enumerate(self.all)]
             if place is not None:
                 charts = [{**entry, **c.placed(place)} for entry, c in zip(charts, self.all, strict=True)]
@@ -284,21 +286,6 @@ def _mercator(z: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Latitude and longitude [deg] of the top left corner of tiles (Web Mercator, EPSG:3857)."""
     n = 2.0**z
     return np.rad2deg(np.arctan(np.sinh(math.pi * (1.0 - 2.0 * y / n)))), x / n * 360.0 - 180.0
-
-
-def _place(at: Solution | None) -> Place | None:
-    """From degrees to the map, where a solution is known both ways."""
-    if at is None or at.latitude is None or at.longitude is None:
-        return None
-    n, e = float(at.position[0]), float(at.position[1])
-    # the origin of the map, from where the vehicle is
-    latitude, longitude, _ = pymap3d.ned2geodetic(-n, -e, 0.0, at.latitude, at.longitude, 0.0)
-
-    def place(lat: Array, lon: Array) -> tuple[Array, Array]:
-        north, east, _ = pymap3d.geodetic2ned(lat, lon, 0.0, latitude, longitude, 0.0)
-        return north, east
-
-    return place
 
 
 def _nothing() -> Response:

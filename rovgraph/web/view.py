@@ -18,6 +18,7 @@ from rovgraph.live.outputs.json_lines import as_dict
 from rovgraph.live.solution import BeaconPlace, RangeCircle, ShipPose, Solution
 from rovgraph.log.units import shown
 from rovgraph.model.calibration import BEAM_SENSORS, TABLE
+from rovgraph.model.origin import Origin, lat_lon
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
 COLUMNS = ("time", "north", "east", "down", "sd")  # of a point; sd is that of the longer axis of its ellipse
@@ -207,8 +208,8 @@ class View:
         s = self.newest
         properties: dict[str, Any] = {"columns": list(COLUMNS), "points": points}
         geometry = None
-        if s is not None and s.latitude is not None and s.longitude is not None and len(points) > 1:
-            geometry = {"type": "LineString", "coordinates": _degrees(points, s)}
+        if s is not None and s.origin is not None and len(points) > 1:
+            geometry = {"type": "LineString", "coordinates": _degrees(points, s.origin)}
         return {"type": "Feature", "geometry": geometry, "properties": properties}
 
     def _beyond(self, s: Solution) -> list[dict[str, str]]:
@@ -231,13 +232,10 @@ class View:
         return found
 
 
-def _degrees(points: list[Any], at: Solution) -> list[list[float]]:
-    """Longitude, latitude and height of points, by a solution whose place is known both ways."""
-    import pymap3d
-
+def _degrees(points: list[Any], origin: Origin) -> list[list[float]]:
+    """Longitude, latitude and height of points."""
     north, east, down = np.array(points)[:, 1:4].T
-    n, e = float(at.position[0]), float(at.position[1])
-    latitude, longitude, _ = pymap3d.ned2geodetic(north - n, east - e, 0.0, at.latitude, at.longitude, 0.0)
+    latitude, longitude = lat_lon(north, east, origin)
     degrees: list[list[float]] = np.column_stack([np.round(longitude, 8), np.round(latitude, 8), -down]).tolist()
     return degrees
 

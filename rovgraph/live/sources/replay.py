@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pymap3d
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -13,6 +12,7 @@ from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources.source import paced
 from rovgraph.log import Log, read_log
 from rovgraph.model.config import Config
+from rovgraph.model.origin import lat_lon
 
 
 @dataclass(frozen=True)
@@ -85,5 +85,5 @@ def _geodetic(log: Log) -> dict[int, Array]:
         return {}
     fix = log["fix"]
     north, east, sd = fix.data.T
-    lat, lon, _ = pymap3d.ned2geodetic(north, east, 0.0, *log.origin, 0.0)
+    lat, lon = lat_lon(north, east, log.origin)
     return dict(zip(fix.row.tolist(), np.column_stack([lat, lon, sd]), strict=True))

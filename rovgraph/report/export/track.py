@@ -15,7 +15,7 @@ from rovgraph.dates import is_unix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.trajectory import Trajectory, read_trajectory
-from rovgraph.model.origin import lat_lon
+from rovgraph.model.origin import Frame, Origin, lat_lon, origin_in
 from rovgraph.report.folder import ACOUSTICS_FILE, SOUNDINGS_FILE, beacon_names_of
 
 CHI2_95 = 5.991  # of two degrees of freedom
@@ -66,16 +66,18 @@ class Track:
     surface : height of the water's surface above sea level [m]
     acoustics : None where the dive has no acoustic system
     soundings : rows of soundings.csv (docs/results.md), None where the DVL measured no ranges
+    frame : of north and east, for an origin that is given later
     """
 
     name: str
     estimate: str
     trajectory: Trajectory
-    origin: tuple[float, float] | None = None
+    origin: Origin | None = None
     fixes: Fixes | None = None
     surface: float = 0.0
     acoustics: ShipAndBeacons | None = None
     soundings: pd.DataFrame | None = field(default=None, compare=False)
+    frame: Frame = "flat"
 
     @cached_property
     def lat_lon(self) -> tuple[Array, Array]:
@@ -126,7 +128,7 @@ class Track:
         if not (len(origin) == 2 and abs(origin[0]) <= 90.0 and abs(origin[1]) <= 180.0):
             given = ", ".join(f"{angle:g}" for angle in origin)
             raise InputError(f"origin {given}: expected latitude and longitude in degrees, such as 43.1 3.2")
-        return replace(self, origin=(float(origin[0]), float(origin[1])), surface=surface)
+        return replace(self, origin=origin_in(self.frame, float(origin[0]), float(origin[1])), surface=surface)
 
     @property
     def has_utc(self) -> bool:
@@ -181,7 +183,7 @@ class Track:
         return replace(self, trajectory=self.trajectory.clamped(wanted))
 
 
-def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float, float]:
+def require_place(name: str, origin: Origin | None) -> Origin:
     """The origin of a dive.
 
     Raises
@@ -249,14 +251,14 @@ def read_track(folder: Path | str, estimate: str | None = None) -> Track:
         found = ", ".join(kinds) or "no trajectory"
         raise InputError(f"{folder}: the {estimate or 'smoothed'} estimate is not in it; there is {found}")
     chosen = kinds[0] if estimate is None else estimate
-    place = summary.get("origin")
-    origin = None if place is None else (float(place["lat_deg"]), float(place["lon_deg"]))
+    place, frame = summary.get("origin"), summary.get("frame", "flat")  # of earlier versions
+    origin = None if place is None else origin_in(frame, float(place["lat_deg"]), float(place["lon_deg"]))
     trajectory = read_trajectory(folder / f"trajectory_{chosen}.csv")
     name = str(summary.get("name") or folder.name)
     fixes, acoustics = _read_fixes(folder), _read_acoustics(folder, summary)
     path = folder / SOUNDINGS_FILE  # of the main estimate, which is the first
     soundings = pd.read_csv(path) if path.is_file() and chosen == kinds[0] else None
-    return Track(name, chosen, trajectory, origin, fixes, acoustics=acoustics, soundings=soundings)
+    return Track(name, chosen, trajectory, origin, fixes, acoustics=acoustics, soundings=soundings, frame=frame)
 
 
 def _read_fixes(folder: Path) -> Fixes | None:
