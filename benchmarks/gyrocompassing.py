@@ -4,25 +4,23 @@
     python benchmarks/gyrocompassing.py --rows "dock, FOG" --seeds 3 --online
     python benchmarks/gyrocompassing.py --figure docs/images/gyrocompassing.png
 
-prints a table in Markdown: heading errors and the sds that are stated, and the least and the largest NEES of the moments
-from the end of the coarse alignment on. Dives go through the command line. A seed gives the rows of one length the same
-motion and the same draws.
+prints a table in Markdown: heading errors and the sds that are stated, and the least and the largest NEES of the
+moments from the end of the coarse alignment on. Dives go through the command line. A seed gives all rows the same
+draws.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from fault_campaign.campaign import merge
-from fault_campaign.earth import Array
 from fault_campaign.instruments import sample
 from fault_campaign.judge import Dive, Result, row_options, run_dive
 from fault_campaign.motion import Motion, Profile
-from fault_campaign.vehicle import GRADES, Imu, Vehicle, configuration
+from fault_campaign.vehicle import GRADES, Vehicle, configuration
 from scipy.stats import chi2
 
 from rovgraph.lab.executors import cores, starting, workers
@@ -87,6 +85,7 @@ def make_dive(setting: Setting, seed: int) -> Dive:
     streams, hidden = sample(motion, vehicle, rng)
     config = configuration(vehicle)
     config["environment"] = {"latitude_deg": setting.latitude}
+    config["calibration"]["gyr_scale"] = {"sd": 1e-4}
     return Dive(streams, merge(config, setting.config or {}), motion, hidden)
 
 

@@ -64,6 +64,12 @@ def why_not(config: Config, origin: tuple[float, float] | None) -> str:
     return "" if np.deg2rad(sd) < WORST_SD else f"it errs by {sd:.0f} deg at latitude {latitude:.4g}"
 
 
+def relies_on_gyro(config: Config) -> bool:
+    """Whether a dive of a configuration, whatever its log, has no heading but the gyro's."""
+    none = config.heading.sources is not None and not config.heading.sources
+    return none and config.start.heading_deg is None and not why_not(config, None)
+
+
 def _latitude(config: Config, origin: tuple[float, float] | None) -> float | None:
     stated = config.environment.latitude
     return origin[0] if stated is None and origin is not None else stated

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, earth_rate_n, rotate, rpy_from_matrix, transpose, wrap_angle
+from rovgraph.inference.gyrocompassing import relies_on_gyro
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import measurement_row as at
 from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS
@@ -42,7 +43,7 @@ from rovgraph.simulate.truth import Truth, correlated, of_waves, remembered
 
 
 def _earth_rate(config: Config) -> Array:
-    """Rate of the Earth in n, shape (3,) [rad/s]; zero where it is not modelled.
+    """Rate of the Earth in n, shape (3,) [rad/s]; zero where neither is it modelled nor does the heading rest on it.
 
     Raises
     ------
@@ -51,11 +52,11 @@ def _earth_rate(config: Config) -> Array:
     env = config.environment
     if env.frame == "earth":
         raise InputError("dives are simulated in environment.frame: flat; state that")
-    if not env.earth_rotation:
+    if not (env.earth_rotation or relies_on_gyro(config)):
         return np.zeros(3)
-    if env.latitude_deg is None:
+    if env.latitude is None:
         raise InputError("environment.earth_rotation needs environment.latitude_deg")
-    return earth_rate_n(float(np.deg2rad(env.latitude_deg)))
+    return earth_rate_n(float(np.deg2rad(env.latitude)))
 
 
 def specific_force_and_rate(motion: Motion, config: Config) -> Array:
