@@ -20,7 +20,7 @@ from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
 from fault_campaign.judge import Dive, Result, row_options, run_dive
 from fault_campaign.motion import Motion, Profile
-from fault_campaign.vehicle import GRADES, Vehicle, configuration
+from fault_campaign.vehicle import GRADES, Depth, Dvl, Vehicle, configuration
 from scipy.stats import chi2
 
 from rovgraph.lab.executors import cores, starting, workers
@@ -79,8 +79,8 @@ def motion_of(setting: Setting, rng: np.random.Generator) -> Motion:
 def make_dive(setting: Setting, seed: int) -> Dive:
     """A dive without heading sensor."""
     rng = np.random.default_rng([44, seed])
-    vehicle = Vehicle(UNITS[setting.unit], ("depth",))
-    vehicle.dvl.yaw_sd = 1.0
+    unit = replace(UNITS[setting.unit], rate=50.0)
+    vehicle = Vehicle(unit, ("depth",), Dvl(rate=2.0, yaw_sd=1.0), depth=Depth(rate=1.0))
     motion = motion_of(setting, rng)
     streams, hidden = sample(motion, vehicle, rng)
     config = configuration(vehicle)
