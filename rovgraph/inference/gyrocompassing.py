@@ -51,15 +51,13 @@ def why_not(config: Config, origin: tuple[float, float] | None) -> str:
     config : as stated, or resolved
     origin : latitude and longitude of the log [deg], where they are known
     """
-    imu, env, latitude = config.imu, config.environment, _latitude(config, origin)
+    imu, latitude = config.imu, _latitude(config, origin)
     if has_constant_velocity(config):
         return "no IMU is used"
     if np.deg2rad(imu.gyr_bias_sd_dps) > WORST_SD * EARTH_RATE:
         return f"its bias (imu.gyr_bias_sd_dps {imu.gyr_bias_sd_dps:g}) hides the Earth's rate, 0.0042 deg/s"
     if latitude is None:
         return "state environment.latitude_deg, and it may"
-    if "earth_rotation" in env.model_fields_set and not env.earth_rotation:
-        return "remove environment.earth_rotation: false, and it may"
     sd = min(np.rad2deg(heading_sd(config, latitude, ALIGN_S)), 90.0)
     return "" if np.deg2rad(sd) < WORST_SD else f"it errs by {sd:.0f} deg at latitude {latitude:.4g}"
 
