@@ -9,6 +9,7 @@ moments from the end of the coarse alignment on. Dives go through the command li
 draws.
 """
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 import pandas as pd
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, row_options, run_dive
+from fault_campaign.judge import Dive, Result, row_options, run_command, run_dive, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import GRADES, Depth, Dvl, Vehicle, configuration
 from scipy.stats import chi2
@@ -151,10 +152,44 @@ ROWS: dict[str, tuple[float, Setting]] = {
 }
 
 
+DRAWN = ("dock, FOG", "dock, tactical, two half turns")
+SEEDS_DRAWN = 6
+
+
+def draw(path: Path) -> None:
+    """Errors of the filtered heading of some dives against time, with the sd that the first one states."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(DRAWN)), DRAWN, strict=True):
+        for seed in range(SEEDS_DRAWN):
+            dive = make_dive(ROWS[name][1], seed)
+            with tempfile.TemporaryDirectory() as folder:
+                write_dive(dive, Path(folder))
+                files = [str(Path(folder) / file) for file in ("log.csv", "vehicle.yaml", "out")]
+                run_command(["smooth", files[0], "--config", files[1], "--out", files[2], "--no-figures"])
+                track = pd.read_csv(Path(folder) / "out" / "trajectory_filtered.csv")
+            off = np.rad2deg(track["yaw"].to_numpy() - dive.motion.heading(track["time"].to_numpy()))
+            if seed == 0:
+                sd = np.rad2deg(track["yaw_sd"])
+                axes.fill_between(track["time"], -2.0 * sd, 2.0 * sd, color="#cccccc", lw=0.0, label="2 sd")
+            axes.plot(track["time"], (off + 180.0) % 360.0 - 180.0, lw=0.9)
+        axes.set_ylim(-5.0, 5.0) if "FOG" in name else axes.set_ylim(-25.0, 25.0)
+        axes.set_title(name, fontsize=9)
+        axes.set_xlabel("time [s]")
+        axes.legend(fontsize=8, frameon=False, loc="upper right")
+    figure.axes[0].set_ylabel("error of the filtered heading [°]")
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Run and print."""
     parser = row_options(__doc__, ROWS, cores())
+    parser.add_argument("--figure", type=Path, help="draw headings against time, instead of the table")
     arguments = parser.parse_args()
+    if arguments.figure:
+        draw(arguments.figure)
+        return
     print("| dive | target | rms (sd) after 2, 5 and 10 minutes | met |\n|---|---|---|---|", flush=True)
     with workers(arguments.jobs) as pool:
         for name in arguments.rows:
