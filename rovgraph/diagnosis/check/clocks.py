@@ -18,7 +18,7 @@ import numpy as np
 
 from rovgraph.diagnosis.check.acceleration import BETTER, DvlAgainstImu, Search
 from rovgraph.diagnosis.check.agreement import heading_lag
-from rovgraph.diagnosis.check.findings import Finding, Level, Timing, since, told, valid_pings
+from rovgraph.diagnosis.check.findings import Finding, Timing, since, told, valid_pings
 from rovgraph.diagnosis.check.inertial import GAP, GAP_OF_PERIODS, inertial_motion
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
@@ -32,7 +32,7 @@ from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
-from rovgraph.sensors import SENSORS
+from rovgraph.sensors import SENSORS, Level
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
 from rovgraph.sensors.water_layer import CELLS
