@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import pandas as pd
 import pytest
-from dives import altered, campaign_log, changed, simulated, smoothed, without
+from dives import altered, campaign_log, changed, kept, simulated, smoothed, without
 from live import flown
 from scipy.stats import chi2
 
@@ -169,8 +169,12 @@ def test_a_gyro_that_cannot_is_refused_in_one_line(sections, said):
 
 def test_a_compass_that_is_left_out_is_named_and_a_short_log_refused():
     case, log = dive(seconds=60.0)
-    with pytest.raises(InputError, match="the gyro shows it after 120 s, and the IMU has 60 s"):
+    with pytest.raises(InputError, match="the gyro shows it in 120 s without a gap, and the IMU has 60 s"):
         initialise(log, FOG)
+    _, long = dive()
+    broken = kept(long, "imu", np.abs(long["imu"].time - 50.0) > 1.0)
+    with pytest.raises(InputError, match="without a gap, and the IMU has 49 s"):
+        initialise(broken, FOG)
     with pytest.raises(InputError, match=r"heading\.sources leaves out mag, dvl_heading"):
         initialise(case.log, FOG)
     assert initialise(case.log, changed(FOG, heading={"sources": ["mag"]})).config.environment.earth_rotation is False

@@ -18,6 +18,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import EARTH_RATE, Array, cross, earth_rate_n, rotate, slerp, turned
+from rovgraph.kernels.motion import LONGEST_BRIDGED_S
 from rovgraph.log import Log, Stream
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.problem.motion import has_constant_velocity
@@ -93,15 +94,19 @@ def with_earth_rate(log: Log, config: Config, sources: Collection[str]) -> Confi
 
     Raises
     ------
-    InputError : the gyro cannot show it, or the log is too short
+    InputError : the gyro cannot show it, the log is too short, or the IMU has a gap at its beginning
     """
     unused = [s for s in HEADING_STREAMS if s in log and s not in sources]
     left_out = f"; heading.sources leaves out {', '.join(unused)}" if unused else ""
     without = f"{log.source}: no heading at the start (mag_x.., ahrs_yaw, heading or dvl_heading{left_out})"
     if why := why_not(config, log.origin):
         raise InputError(f"{without}; give start.heading_deg, as the gyro does not show it: {why}")
-    if (seconds := float(np.ptp(log["imu"].time))) < ALIGN_S:
-        raise InputError(f"{without}; the gyro shows it after {ALIGN_S:.0f} s, and the IMU has {seconds:.0f} s")
+    time = log["imu"].time
+    gap = np.flatnonzero(np.diff(time) > LONGEST_BRIDGED_S)
+    seconds = float((time[gap[0]] if len(gap) else time[-1]) - time[0])
+    if seconds < ALIGN_S:
+        text = f"the gyro shows it in {ALIGN_S:.0f} s without a gap, and the IMU has {seconds:.0f} s"
+        raise InputError(f"{without}; {text}")
     environment = config.environment.model_copy(update={"earth_rotation": True})
     return config.model_copy(update={"environment": environment})
 

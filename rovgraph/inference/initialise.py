@@ -1,9 +1,10 @@
 """Initial conditions of a dive from its first seconds: attitude, heading, position, biases.
 
 Attitude comes from gravity (specific force averaged in the axes of the first sample), heading from the log's heading
-sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. An
-explicit ``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often
-wrong as any other, and here no gate would find it.
+sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. Where
+no source shows the heading, attitude comes by the Earth's rate (`rovgraph.inference.gyrocompassing`). An explicit
+``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often wrong as
+any other, and here no gate would find it.
 
 Each heading source gives the angle about down by which an attitude must be turned, through the instrument's own model,
 so one function serves all sources. `with_motion_model` decides whether a dive is estimated without an IMU, and where
