@@ -9,7 +9,11 @@ so C, the first attitude, takes one cloud of points to another. The constant hol
 move and the vehicle may be under way; without a DVL it is taken to stay about its place (Wu and Pan, IEEE Transactions
 on Aerospace and Electronic Systems 49, 2013; the fit Kabsch 1976). Left out are the Coriolis acceleration and the turn
 of n with the vehicle, together half a degree of heading at 2 m/s. That is a place to linearise at; the estimate finds
-the heading from the same samples, so its prior is `WIDER` than what these samples show: they count once.
+the heading from the same samples, so its prior has `OPEN_SD`. Much wider, a filter would wander before it knows better.
+
+The first heading errs by the gyro's bias, as the estimate does: with s the heading's sd by the bias, a prior of sd p
+about it says once more, with sd p, that the bias is none. `bias_factor` is what takes that from the bias's own prior,
+so that both together are as wide as stated: 1 / (1 / (k s)^2 + 1 / p^2) = s^2.
 """
 
 from collections.abc import Collection
@@ -25,8 +29,8 @@ from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
 ALIGN_S = 120.0  # of the first samples
-WIDER = 8.0  # times, the prior's sd
-WORST_SD = np.deg2rad(20.0)  # of a heading by the gyro's bias, beyond which the gyro does not show it [rad]
+OPEN_SD = np.deg2rad(20.0)  # of the first heading [rad]
+WORST_SD = np.deg2rad(12.0)  # of a heading by the gyro's bias, beyond which the gyro does not show it [rad]
 WITHOUT_DVL_HZ = 5.0  # of the times at which a vehicle without a DVL is taken to rest
 FAR_OFF = 5.0  # medians of the residual: pings beyond are left out
 
@@ -42,6 +46,11 @@ def heading_sd(config: Config, latitude_deg: float, seconds: float) -> float:
     """
     rate_sd = np.hypot(np.deg2rad(config.imu.gyr_bias_sd_dps), config.imu.noise.gyr / np.sqrt(seconds))
     return float(rate_sd / max(earth_rate_n(np.deg2rad(latitude_deg))[0], 1e-9))
+
+
+def bias_factor(config: Config, latitude_deg: float) -> float:
+    """Factor of the sd of the gyro's horizontal bias beside a first heading that the gyro has shown."""
+    return float((1.0 - (heading_sd(config, latitude_deg, np.inf) / OPEN_SD) ** 2) ** -0.5)
 
 
 def why_not(config: Config, origin: tuple[float, float] | None) -> str:

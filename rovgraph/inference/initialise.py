@@ -34,9 +34,9 @@ from rovgraph.geometry import (
 from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_compass
 from rovgraph.inference.gyrocompassing import (
     ALIGN_S,
-    WIDER,
+    OPEN_SD,
+    bias_factor,
     coarse_attitude,
-    heading_sd,
     with_earth_rate,
     without_turns,
 )
@@ -527,6 +527,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)
     if by_gyro:
         R_nb, rpy_sd = _attitude_by_gyro(log, config, assumptions)
+        bias_sd[3:5] *= bias_factor(config, config.environment.latitude or 0.0)
     else:
         R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
     if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
@@ -771,10 +772,9 @@ def _attitude_by_gyro(log: Log, config: Config, assumptions: list[str]) -> tuple
         tilt if said is None else float(np.deg2rad(said))
         for said, tilt in ((start.roll_deg, roll), (start.pitch_deg, pitch))
     )
-    heading, latitude = np.rad2deg(yaw) % 360.0, config.environment.latitude or 0.0
+    heading, tilt_sd = np.rad2deg(yaw) % 360.0, np.deg2rad(start.tilt_sd_deg)
     assumptions.append(f"start.heading_deg {heading:.1f}, by the Earth's rate in the first {ALIGN_S:.0f} s")
-    tilt_sd, yaw_sd = np.deg2rad(start.tilt_sd_deg), WIDER * heading_sd(config, latitude, ALIGN_S)
-    return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, max(yaw_sd, UNKNOWN_HEADING_SD)])
+    return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, OPEN_SD])
 
 
 def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, Array]:
