@@ -5,7 +5,7 @@ that any leading axes broadcast.
 """
 
 from functools import cache
-from itertools import permutations, product
+from itertools import accumulate, permutations, product
 from typing import TypeVar
 
 import numpy as np
@@ -311,6 +311,18 @@ def matrix_from_quaternion(xyzw: ArrayLike) -> Array:
         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turned(time: Array, rate_b: Array) -> Array:
+    """Rotations from the body's axes at each sample of a gyro to those at the first, shape (n, 3, 3).
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,) [s]
+    rate_b : ndarray, shape (n, 3) [rad/s]
+    """
+    steps = exp_rotation(0.5 * (rate_b[1:] + rate_b[:-1]) * np.diff(time)[:, None])
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
 
 
 def earth_rate_n(latitude: float) -> Array:

@@ -28,7 +28,7 @@ from rovgraph.lab.evaluate import read_reference
 from rovgraph.lab.misalignment import Tables, chosen, open_results, read_study
 from rovgraph.lab.misalignment import study as study_cells
 from rovgraph.lab.misalignment.results import kept_so_far
-from rovgraph.lab.observability import Observability, estimating
+from rovgraph.lab.observability import START_HEADING, Observability, estimating
 from rovgraph.lab.observability import observe as observe_calibration
 from rovgraph.lab.plan import CANDIDATES, KnownComponents, Plan, SensorRates, usual
 from rovgraph.lab.plan import manoeuvres as candidates_of
@@ -340,7 +340,7 @@ def plan(
     goals : label of a component -> wanted sd, radians and SI; or texts such as "dvl_yaw=1deg"; what the configuration
         considers is estimated where it is a goal
     known : result of an earlier dive, or its ``observability.json``; None = none
-    duration : of each manoeuvre [s]; None = 120, or 900 where a goal is acoustic
+    duration : of each manoeuvre [s]; None = 120, or 900 where a goal is acoustic or the heading
     manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all that serve the goals
     estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     sensors : their rates
@@ -355,7 +355,8 @@ def plan(
     considered = [name for name, b in beliefs(config).items() if b.considered and {*b.variable.labels} & {*wanted}]
     config = estimating(config, [*listed(estimate), *considered])
     names = usual(config, wanted)
-    duration = duration or (DURATION_S if names == CANDIDATES else SURVEY_S)
+    short = names == CANDIDATES and START_HEADING.name not in wanted
+    duration = duration or (DURATION_S if short else SURVEY_S)
     candidates = candidates_of(listed(manoeuvres) or names, duration)
     before: KnownComponents | None
     if isinstance(known, ObservabilityResult):

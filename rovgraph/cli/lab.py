@@ -264,7 +264,9 @@ def plan(
     ] = None,
     duration: Annotated[
         float | None,
-        typer.Option(help="duration of each manoeuvre in seconds; default: 120, or 900 where a goal is acoustic"),
+        typer.Option(
+            help="duration of each manoeuvre in seconds; default: 120, or 900 for goals of acoustics or heading"
+        ),
     ] = None,
     manoeuvres: Annotated[
         str | None,

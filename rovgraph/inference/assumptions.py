@@ -66,7 +66,11 @@ def rests_on_doubtful_compass(initial: InitialConditions) -> bool:
 
 
 def unchecked(
-    config: Config, sources: Collection[str], present: Collection[str], expected: Collection[str] = ()
+    config: Config,
+    sources: Collection[str],
+    present: Collection[str],
+    expected: Collection[str] = (),
+    by_gyro: bool = False,
 ) -> list[str]:
     """Assumptions behind heading, distances and depth that no sensor checks, a line each.
 
@@ -76,6 +80,7 @@ def unchecked(
     sources : heading sources in use
     present : streams of the log
     expected : streams that may still come
+    by_gyro : whether the gyro shows the heading at the start, by the Earth's rate
     """
     priors, start = beliefs(config), config.start
     lines: list[str] = []
@@ -84,6 +89,8 @@ def unchecked(
         rests = [_held_by(priors[OFFSETS[source]]) for source in sources]
         if start.heading_deg is not None:
             rests.append(f"start.heading_deg, sd {start.heading_sd_deg:g} deg")
+        if by_gyro:
+            rests.append(f"the gyro's bias, sd {config.imu.gyr_bias_sd_dps:.2g} deg/s")
         lines.append(f"no fix{so_far} shows a constant error of the heading, which rests on {'; '.join(rests)}")
         if "dvl" in {*present, *expected}:
             scale = _held_by(priors["dvl_scale"])

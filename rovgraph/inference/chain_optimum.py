@@ -168,6 +168,10 @@ class ChainOptimum:
         return self.chain.problem
 
     @property
+    def initial(self) -> InitialConditions:
+        return self.chain.initial
+
+    @property
     def beliefs(self) -> Mapping[str, Belief]:
         return self.chain.beliefs
 

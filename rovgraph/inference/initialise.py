@@ -1,9 +1,10 @@
 """Initial conditions of a dive from its first seconds: attitude, heading, position, biases.
 
 Attitude comes from gravity (specific force averaged in the axes of the first sample), heading from the log's heading
-sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. An
-explicit ``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often
-wrong as any other, and here no gate would find it.
+sources in the order of their accuracy, and the gyro's bias from standing still, where the vehicle stands still. Where
+no source shows the heading, attitude comes by the Earth's rate (`rovgraph.inference.gyrocompassing`). An explicit
+``start`` takes precedence over all of it. No value rests on a single sample: the first of a sensor is as often wrong as
+any other, and here no gate would find it.
 
 Each heading source gives the angle about down by which an attitude must be turned, through the instrument's own model,
 so one function serves all sources. `with_motion_model` decides whether a dive is estimated without an IMU, and where
@@ -12,7 +13,6 @@ it then begins.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +28,18 @@ from rovgraph.geometry import (
     rotate,
     rpy_from_matrix,
     transpose,
+    turned,
     wrap_angle,
 )
 from rovgraph.inference.assumptions import nothing_checks, unchecked, unchecked_compass
+from rovgraph.inference.gyrocompassing import (
+    ALIGN_S,
+    OPEN_SD,
+    bias_factor,
+    coarse_attitude,
+    with_earth_rate,
+    without_turns,
+)
 from rovgraph.kernels.assembly import NOISIER
 from rovgraph.kernels.earth import normal_gravity
 from rovgraph.log import Log, Stream
@@ -204,7 +213,7 @@ def level(log: Log, config: Config) -> Level:
     )
     if quiet and not _moves(log):
         return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds)
-    return Level(rotate(_turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
+    return Level(rotate(turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
 
 
 def _moves(log: Log) -> bool:
@@ -240,37 +249,26 @@ def first_heading(
     ----------
     log, config : the dive, and what is believed of it
     sensors : instruments by stream
-    sources : heading sources of the log
+    sources : heading sources of the log, one of which measures in the first `WITHIN_S`
     levelled : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
     gyro_bias : ndarray, shape (3,), as far as it is known [rad/s]
-
-    Raises
-    ------
-    InputError : no source measures early enough
     """
     begin, means = log["imu"].time[0], {name: b.mean for name, b in beliefs(config).items()}
-    for source in by_accuracy(config, sources):
-        stream = _opening(log[source], begin, WITHIN_S)
-        if not len(stream):
-            continue
-        stream = _opening(stream, stream.time[0], WINDOW_S)
-        stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
-        imu = _opening(log["imu"], begin, stream.time[-1] - begin)
-        turned = _turned(imu.time, imu.data[:, 3:] @ mount_matrix(config.imu.mount_rpy_deg).T - gyro_bias)
-        there = levelled @ turned[imu.time.searchsorted(stream.time, "right") - 1]
-        yaws = solve_turn(sensors[source], stream.data[:, : sensors[source].model.dim], there, means)
-        apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
-        return float(yaws[int(np.argmin(apart))]), source
-    raise InputError(
-        f"{log.source}: no heading in the first {WITHIN_S:.0f} s (mag_x.., ahrs_yaw, heading or dvl_heading) and no "
-        "start.heading_deg; give start.heading_deg in the configuration"
-    )
+    source = next(s for s in by_accuracy(config, sources) if len(_opening(log[s], begin, WITHIN_S)))
+    stream = _opening(log[source], begin, WITHIN_S)
+    stream = _opening(stream, stream.time[0], WINDOW_S)
+    stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
+    imu = _opening(log["imu"], begin, stream.time[-1] - begin)
+    turns = turned(imu.time, imu.data[:, 3:] @ mount_matrix(config.imu.mount_rpy_deg).T - gyro_bias)
+    there = levelled @ turns[imu.time.searchsorted(stream.time, "right") - 1]
+    yaws = solve_turn(sensors[source], stream.data[:, : sensors[source].model.dim], there, means)
+    apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
+    return float(yaws[int(np.argmin(apart))]), source
 
 
-def _turned(time: Array, rate_b: Array) -> Array:
-    """Rotations from the body's axes at each sample of the gyro to those at the first, shape (n, 3, 3)."""
-    steps = exp_rotation(0.5 * (rate_b[1:] + rate_b[:-1]) * np.diff(time)[:, None])
-    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
+def _begins_with_heading(log: Log, sources: Collection[str]) -> bool:
+    """Whether a heading source measures early enough for the start."""
+    return any(len(_opening(log[source], log["imu"].time[0], WITHIN_S)) for source in sources)
 
 
 def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
@@ -478,7 +476,8 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
 
     Raises
     ------
-    InputError : neither an IMU nor roll and pitch; neither DVL nor fixes; no heading and no ``start.heading_deg``
+    InputError : neither an IMU nor roll and pitch; neither DVL nor fixes; no heading, no ``start.heading_deg``, and no
+        gyro that shows it
     """
     assumptions: list[str] = []
     log, config = with_motion_model(log, config, assumptions)
@@ -513,15 +512,25 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     ]
     used = without_heading + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
-    assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
-    resting = unchecked(config, sources, log.sensors, expected)
+    if by_gyro := config.start.heading_deg is None and not _begins_with_heading(log, sources):
+        config = with_earth_rate(log, config, sources)
+        assumptions.append(f"heading from the Earth's rate by the gyro, {without_turns(config, log.origin)}")
+    else:
+        assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
+    resting = unchecked(config, sources, log.sensors, expected, by_gyro)
     if compass:
         assumptions.insert(0, nothing_checks(resting.pop(0), turns_show=not has_constant_velocity(config)))
     assumptions += resting
 
     first = level(log, config)
+    if by_gyro:  # what it reads at rest is no bias before its heading is known
+        first = first._replace(quiet=False)
     bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)
-    R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
+    if by_gyro:
+        R_nb, rpy_sd = _attitude_by_gyro(log, config, assumptions)
+        bias_sd[3:5] *= bias_factor(config, config.environment.latitude or 0.0)
+    else:
+        R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
     if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
         bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
     p_n, p_sd = first_position(log, config, R_nb, assumptions)
@@ -772,6 +781,19 @@ def _attitude(
     else:
         yaw = np.deg2rad(start.heading_deg)
     return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, yaw_sd])
+
+
+def _attitude_by_gyro(log: Log, config: Config, assumptions: list[str]) -> tuple[Array, Array]:
+    """R_nb of the first epoch by the Earth's rate, and the sd of roll, pitch, yaw."""
+    start = config.start
+    roll, pitch, yaw = rpy_from_matrix(coarse_attitude(log, config)).tolist()
+    roll, pitch = (
+        tilt if said is None else float(np.deg2rad(said))
+        for said, tilt in ((start.roll_deg, roll), (start.pitch_deg, pitch))
+    )
+    heading, tilt_sd = np.rad2deg(yaw) % 360.0, np.deg2rad(start.tilt_sd_deg)
+    assumptions.append(f"start.heading_deg {heading:.1f}, by the Earth's rate in the first {ALIGN_S:.0f} s")
+    return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, OPEN_SD])
 
 
 def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from rovgraph.inference.gauss_newton import GaussNewtonResult
 from rovgraph.model.calibration import Belief
 from rovgraph.model.state import State
 from rovgraph.problem.calibration_roles import CalibrationRoles
+from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
 from rovgraph.problem.problem import Problem
 
@@ -45,7 +46,7 @@ class Optimum(Protocol):
 
     Attributes
     ----------
-    problem : the dive, each landmark given to its place
+    problem, initial : the dive, each landmark given to its place, and how it begins
     beliefs, unknowns : the calibration variables
     blocks : sensor -> its measurements
     state : State of n epochs; calibration that walks has shape (n, dim), all other (dim,)
@@ -56,6 +57,8 @@ class Optimum(Protocol):
 
     @property
     def problem(self) -> Problem: ...
+    @property
+    def initial(self) -> InitialConditions: ...
     @property
     def beliefs(self) -> Mapping[str, Belief]: ...
     @property

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.lab.observability import START_HEADING
 from rovgraph.lab.plan import KnownComponents
 from rovgraph.model.calibration import TABLE, beacon_names
 
@@ -55,8 +56,8 @@ def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
 def _goal(text: str) -> dict[str, float]:
     label, _, number = text.partition("=")
     label = label.strip()
-    label = FIRST_BEACON if label == "beacon" else label
-    variable = next((v for v in TABLE.values() if label in (v.name, *v.labels)), None)
+    label = {"beacon": FIRST_BEACON, "heading": START_HEADING.name}.get(label, label)
+    variable = next((v for v in (*TABLE.values(), START_HEADING) if label in (v.name, *v.labels)), None)
     if variable is None:
         every = [known for v in TABLE.values() for known in v.labels]
         near = difflib.get_close_matches(label, every, 1)

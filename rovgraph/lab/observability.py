@@ -6,6 +6,8 @@ information of noise in the estimate is removed (`rovgraph.inference.observabili
 `directions` finds the directions of the calibration that a dive leaves open; `in_words` describes them. An eigenvector
 of the information, in units of the prior's sd, is a combination of components that the data determine independently of
 the others; its sd as a part of the prior's is (1 + eigenvalue)^-1/2.
+
+Where no compass shows the heading and the Earth's rotation is modelled, the heading at the start is a component too.
 """
 
 import difflib
@@ -32,12 +34,17 @@ from rovgraph.log.frozen import without_frozen
 from rovgraph.model.calibration import TABLE, Variable
 from rovgraph.model.config import Config
 from rovgraph.process import Progress, no_progress
+from rovgraph.sensors.instruments import HEADING_STREAMS
 
 TIMES = 30  # at which the sd is calculated
 FEWEST_KEYFRAMES = 20
 OTHER_LABELS = (
     "acc_bias_x", "acc_bias_y", "acc_bias_z", "gyr_bias_x", "gyr_bias_y", "gyr_bias_z",
     "start_roll", "start_pitch", "start_heading",
+)  # fmt: skip
+START_HEADING = Variable(
+    "start_heading", "", ("",), "rad", np.nan, ("imu",), "heading at the start, by the Earth's rate",
+    "minutes on one heading, half a turn, and as long again",
 )  # fmt: skip
 
 
@@ -116,6 +123,7 @@ class Observability:
         """Pairs with their correlation, the strongest first."""
         names, c = (*self.labels, *OTHER_LABELS), len(self.labels)
         pairs = [(i, j) for i in range(c) for j in range(i + 1, len(names)) if abs(self.correlation[i, j]) > beyond]
+        pairs = [(i, j) for i, j in pairs if names[i] != names[j]]
         pairs.sort(key=lambda p: -abs(self.correlation[p]))
         return [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
 
@@ -183,7 +191,7 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
     # shows constants that are not estimated because noise would bias them
     moved = [name for name in dive.unknowns.considered if dive.beliefs[name].estimate]
     dive = dive.estimating(moved) if moved else dive
-    if not dive.unknowns.estimated:
+    if not dive.unknowns.estimated and not rests_on_gyro(dive):
         raise InputError(
             f"{log.source}: no calibration variable is estimated; give --estimate, or estimate: true in calibration"
         )
@@ -202,28 +210,42 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     progress("information", 0.6)
     ends = np.unique(np.linspace(0, len(dive.problem) - 1, TIMES + 1).round().astype(int)[1:]).tolist()
     known = dive.knowledge(ends)
-    before = np.array([np.concatenate(list(joint_prior_sd(dive, end).values())) for end in ends])
+    before = np.array([np.concatenate([np.empty(0), *joint_prior_sd(dive, end).values()]) for end in ends])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)
-    information = without_spurious_information(dive, ends, seen, before) if noisy else seen
-    variables = tuple(TABLE[name] for name in dive.unknowns.estimated for _ in TABLE[name].labels)
-    labels = tuple(label for name in dive.unknowns.estimated for label in TABLE[name].labels)
-    begin = float(dive.problem.time[0])
+    information = without_spurious_information(dive, ends, seen, before) if noisy and before.size else seen
+    variables, c = [TABLE[name] for name in dive.unknowns.estimated], before.shape[1]
+    calibration = relative_covariance(information) * before[:, :, None] * before[:, None, :]
+    joint = np.array([_with_others(P, C) for P, C in zip(known.covariance, calibration, strict=True)])
+    claimed, rows = np.sqrt(np.diag(known.calibration[-1])), np.arange(c)
+    if rests_on_gyro(dive):
+        variables, rows = [*variables, START_HEADING], np.append(rows, c + OTHERS - 1)
+        before = np.column_stack([before, np.full(len(ends), dive.initial.prior.rpy_sd[2])])
+        claimed = np.append(claimed, np.sqrt(known.covariance[-1, OTHERS - 1, OTHERS - 1]))
+        information = np.array(
+            [data_information(P[np.ix_(rows, rows)], sd) for P, sd in zip(joint, before, strict=True)]
+        )
+    sd, columns = np.sqrt(np.diag(joint[-1])), np.concatenate([rows, np.arange(c, c + OTHERS)])
     relative = np.sqrt(np.diagonal(relative_covariance(information), axis1=1, axis2=2))
     return Observability(
-        labels,
-        variables,
+        tuple(label for v in variables for label in v.labels),
+        tuple(v for v in variables for _ in v.labels),
         before[-1],
-        np.sqrt(np.diag(known.calibration[-1])),
+        claimed,
         information[-1],
-        _correlation(known.covariance[-1], relative_covariance(information[-1]) * np.outer(before[-1], before[-1])),
-        dive.problem.time[ends] - begin,
+        (joint[-1] / np.outer(sd, sd))[np.ix_(rows, columns)],
+        dive.problem.time[ends] - float(dive.problem.time[0]),
         relative * before / before[-1],
     )
 
 
-def _correlation(joint: Array, calibration: Array) -> Array:
-    """Of the calibration with itself and with others, shape (c, c + others).
+def rests_on_gyro(dive: Optimum) -> bool:
+    """Whether no compass shows the heading, and the Earth's rotation is modelled."""
+    return dive.initial.config.environment.earth_rotation and not any(s in HEADING_STREAMS for s in dive.blocks)
+
+
+def _with_others(joint: Array, calibration: Array) -> Array:
+    """Covariance of the calibration and others, shape (c + others, c + others).
 
     Parameters
     ----------
@@ -234,9 +256,7 @@ def _correlation(joint: Array, calibration: Array) -> Array:
     of_c, other = slice(OTHERS, None), slice(0, OTHERS)
     slope = np.linalg.solve(joint[of_c, of_c], joint[of_c, other]).T
     spread = joint[other, other] + slope @ (calibration - joint[of_c, of_c]) @ slope.T
-    both = np.concatenate([calibration, calibration @ slope.T], axis=1)
-    sd = np.sqrt(np.concatenate([np.diag(calibration), np.diag(spread)]))
-    return np.asarray(both / np.outer(sd[: len(calibration)], sd))
+    return np.block([[calibration, calibration @ slope.T], [slope @ calibration, spread]])
 
 
 TAKES_PART = 0.25  # a component's share of a direction, of the largest one's

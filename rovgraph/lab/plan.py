@@ -14,8 +14,9 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.gyrocompassing import relies_on_gyro
 from rovgraph.lab.executors import cores, in_workers
-from rovgraph.lab.observability import Observability, examined, joint_bits, solved
+from rovgraph.lab.observability import START_HEADING, Observability, examined, joint_bits, solved
 from rovgraph.log import Log
 from rovgraph.model.calibration import ACOUSTICS, TABLE, beacon_names
 from rovgraph.model.config import AS_WRITTEN, Config, beliefs
@@ -148,7 +149,8 @@ class KnownComponents:
 
     def information(self, labels: Sequence[str], sd: Array) -> Array:
         """Information of its data on some components, shape (c, c), in units of ``sd``; the others are marginalised."""
-        both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in labels]
+        shared = {*labels} - {START_HEADING.name}  # that of another dive
+        both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in shared]
         out = np.zeros((len(labels), len(labels)))
         if both:
             there, here = (np.array(column) for column in zip(*both, strict=True))
@@ -237,7 +239,8 @@ def plan(
     if not candidates:
         raise InputError("no manoeuvres to choose from; give --manoeuvres")
     goals, known = dict(goals or {}), known or KnownComponents.nothing()
-    _check(goals, [label for b in beliefs(config).values() if b.estimate for label in b.variable.labels])
+    by_gyro = [START_HEADING.name] if relies_on_gyro(config) or config.environment.earth_rotation else []
+    _check(goals, [label for b in beliefs(config).values() if b.estimate for label in b.variable.labels] + by_gyro)
     work = partial(predicted, config=config, duration=duration, sensors=sensors or SensorRates())
     each = in_workers(work, candidates, min(cores(), len(candidates)), progress)
     # what is considered is estimated where a manoeuvre shows it, which others may not do

@@ -16,6 +16,7 @@ from rovgraph.diagnosis.check.values import angles, gravity, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FixedLag
+from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
@@ -317,7 +318,8 @@ class Startup:
         if not imu:
             self.waits_for = NEEDS_IMU
             return None
-        first = imu[-1] - WITHIN_S
+        by_gyro = self.config.start.heading_deg is None and not why_not(self.config, origin)
+        first = imu[-1] - (ALIGN_S + MARGIN_S if by_gyro else WITHIN_S)
         self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]

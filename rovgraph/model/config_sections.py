@@ -58,7 +58,9 @@ class StartSettings(ConfigSection):
     north_m: float | None = Field(None, description="north of the first epoch; null = 0 beside east_m, else first fix")
     east_m: float | None = Field(None, description="east of the first epoch; null = 0 beside north_m, else first fix")
     down_m: float | None = Field(None, description="depth of the first epoch; null = first depth sample, else 0")
-    heading_deg: float | None = Field(None, description="heading; null = first heading samples")
+    heading_deg: float | None = Field(
+        None, description="heading; null = first heading samples, without any the Earth's rate by a gyro"
+    )
     roll_deg: float | None = Field(None, description="roll; null = gravity")
     pitch_deg: float | None = Field(None, description="pitch; null = gravity")
     position_sd_m: Positive = Field(0.1, description="sd of the start's north and east")

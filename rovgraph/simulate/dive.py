@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import EARTH_RATE, Array, rotate, rpy_from_matrix, transpose, wrap_angle
+from rovgraph.inference.gyrocompassing import relies_on_gyro
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, latitude_at, normal_gravity, radii
@@ -75,7 +76,7 @@ def _turning(motion: Motion, config: Config) -> tuple[Array, Array, Array]:
         w_in = np.column_stack([east, -north, -east * np.tan(latitude)])
         g_n[:, 2] = env.gravity + normal_gravity(latitude) - normal_gravity(env.earth_latitude)
         g_n[:, 2] += GRAVITY_PER_DEPTH * motion.p_n[:, 2]
-    if env.frame == "earth" or env.earth_rotation:
+    if env.frame == "earth" or env.earth_rotation or relies_on_gyro(config):
         w_ie = EARTH_RATE * np.column_stack([np.cos(latitude), np.zeros(len(motion)), -np.sin(latitude)])
     return w_ie, w_ie + w_in, g_n
 

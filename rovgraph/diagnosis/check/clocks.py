@@ -23,6 +23,7 @@ from rovgraph.diagnosis.check.inertial import GAP, GAP_OF_PERIODS, inertial_moti
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.errors import warn
+from rovgraph.inference.gyrocompassing import why_not, without_turns
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import FrozenStretch, Runs, false_values, repeats, without
 from rovgraph.log.stamps import few_digits
@@ -31,7 +32,7 @@ from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.rules import ACCELERATION, EPOCH_SD_S, SILENT_S
-from rovgraph.sensors import SENSORS
+from rovgraph.sensors import SENSORS, Level
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import heading_sources
 from rovgraph.sensors.water_layer import CELLS
@@ -286,12 +287,15 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
         elif sensor.if_missing is not None and sensor.name not in log:
             yield Finding(sensor.name, *sensor.if_missing, "missing")
     if not heading_sources(config, log.sensors):
-        known = (
-            "heading starts at start.heading_deg and drifts with the gyro"
-            if config.start.heading_deg is not None
-            else "give mag, ahrs_yaw, heading or dvl_heading, or at least start.heading_deg"
-        )
-        yield Finding("log", "warning", f"no heading source in use: {known}", "missing")
+        level: Level = "warning"
+        if config.start.heading_deg is not None:
+            known = "heading starts at start.heading_deg and drifts with the gyro"
+        elif why := why_not(config, log.origin) if "imu" in log else "no IMU is used":
+            known = "give mag, ahrs_yaw, heading or dvl_heading, or at least start.heading_deg; "
+            known += f"the gyro does not show it: {why}"
+        else:
+            level, known = "ok", f"the gyro shows it by the Earth's rate, {without_turns(config, log.origin)}"
+        yield Finding("log", level, f"no heading source in use: {known}", "missing")
 
 
 def overlap(log: Log, config: Config) -> Iterator[Finding]:
