@@ -438,7 +438,6 @@ def _one_line(path: Path) -> Iterator[None]:
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
 CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
-KNOWN = "sources.json"
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
@@ -520,13 +519,9 @@ class Files:
                 return None
         if self.replayed or self.state is None:
             # recorded under rovgraph's own names, in SI
-            return replace(
-                read_log(
-                    path, Config(environment=self.config.environment, depth=self.config.depth, sound=self.config.sound)
-                ),
-                config=None,
-            )
-        return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))
+            config = Config(environment=self.config.environment)
+            return replace(read_log(path, config, keep_pressure=True), config=None)
+        return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path), keep_pressure=True)
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
@@ -584,39 +579,6 @@ class Files:
     def close(self) -> None:
         self.keeper.close()
         self.recorder.close()
-
-
-class KnownSources(dict[str, float]):
-    """Values that sources have found and a resumed run needs, such as the pressure at the surface, in a file.
-
-    Parameters
-    ----------
-    folder : of the run; None = it is not kept
-    resume : continue with what is there
-    warnings : receives that it cannot be written
-    """
-
-    def __init__(self, folder: Path | None, resume: bool, warnings: Warnings) -> None:
-        super().__init__()
-        self._path, self._warnings = None if folder is None else folder / KNOWN, warnings
-        if resume and self._path is not None and self._path.is_file():
-            try:
-                self.update({str(key): float(value) for key, value in json.loads(self._path.read_bytes()).items()})
-            except (OSError, ValueError, TypeError, AttributeError):
-                warnings.complain(str(self._path), "damaged", "is damaged: what sources had found out is found again")
-
-    def __setitem__(self, key: str, value: float) -> None:
-        if self.get(key) == value:
-            return
-        super().__setitem__(key, value)
-        if self._path is None:
-            return
-        partial = self._path.with_name(f".{KNOWN}.partial")
-        try:
-            partial.write_text(json.dumps(self), encoding="utf-8")
-            partial.replace(self._path)
-        except OSError as error:
-            self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
 
 
 def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:

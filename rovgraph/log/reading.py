@@ -63,7 +63,11 @@ Origin = tuple[float, float] | None  # latitude and longitude [deg] of north = e
 
 
 def read_streams(
-    tables: Iterable[Table], config: Config, source: str, notes: list[str] | None = None
+    tables: Iterable[Table],
+    config: Config,
+    source: str,
+    notes: list[str] | None = None,
+    keep_pressure: bool = False,
 ) -> tuple[dict[str, Stream], Origin]:
     """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
@@ -72,6 +76,7 @@ def read_streams(
     tables : whose columns feed different streams
     source : their name, for messages
     notes : to be added to, how it was read
+    keep_pressure : they are not turned into depths
 
     Returns
     -------
@@ -95,7 +100,8 @@ def read_streams(
         found |= streams
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
-    _add_depth(found, config, origin, source, [] if notes is None else notes)
+    if not keep_pressure:
+        _add_depth(found, config, origin, source, [] if notes is None else notes)
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))

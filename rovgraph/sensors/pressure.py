@@ -7,7 +7,7 @@ Reading a log and the online mode take pressures one by one through the same `De
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from rovgraph.sensors.sensor import Column, Sensor
 PRESSURE = Sensor("pressure", (Column("pressure", "pressure"),), may_begin_later=True)  # becomes the stream "depth"
 STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
 LEAST, MOST = 50_000.0, 108_500.0  # of air where people dive, mountain lakes included [Pa]
+AT_SEA = 87_000.0  # least that was ever measured at sea level [Pa]
 SEA = 1025.0  # density [kg/m^3]
 FRESH, BY_SALT = 999.7, 0.778  # at 10 deg C [kg/m^3], and by a psu
 BLOCK_S = 5.0  # of pressures that are looked at together
@@ -156,7 +157,12 @@ def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -
     return by.depth(pascal, surface, latitude), by.says(surface)
 
 
-def complaints(pascal: Array, factor: float, units: dict[str, float], source: str) -> Iterator[str]:
+def units_of_air(number: float, units: Mapping[str, float]) -> list[str]:
+    """Units, of those with their factors to pascals, in which a number is the air's pressure at sea level."""
+    return [unit for unit, factor in units.items() if AT_SEA <= number * factor <= MOST]
+
+
+def complaints(pascal: Array, factor: float, units: Mapping[str, float], source: str) -> Iterator[str]:
     """Doubts about pressures in a log that states no ``depth.surface_hpa``, a line each.
 
     Parameters
@@ -170,7 +176,7 @@ def complaints(pascal: Array, factor: float, units: dict[str, float], source: st
     InputError : they are no absolute pressures
     """
     least, most = (float(np.nanquantile(pascal, q)) for q in (0.01, 0.99))
-    meant = [unit for unit, to_pascal in units.items() if 87_000.0 <= least / factor * to_pascal <= MOST]
+    meant = units_of_air(least / factor, units)
     better = f"state units: {{pressure: {meant[-1]}}}" if meant else ""
     if least > MOST:
         hint = f"if it was at the surface, the unit is {meant[-1]}: {better}" if meant else "state depth.surface_hpa"

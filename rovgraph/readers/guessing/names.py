@@ -32,6 +32,7 @@ _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 _RATES = {"rate", "speed"}
 _SCALARS = {
     "depth": {"depth", "tiefe"},
+    "pressure": {"pressure", "press", "druck"},
     "dvl_altitude": {"altitude", "altimeter", "alt", "range", "height", "hoehe", "höhe"},
     "fix_lat": {"lat", "latitude", "breite", "breitengrad"},
     "fix_lon": {"lon", "lng", "longitude", "länge", "laenge", "längengrad"},
@@ -55,7 +56,6 @@ _DERIVED = {
                      "odometry"), "an estimate"),
     **dict.fromkeys(("delta", "increment", "error", "err"), "not a measurement that a log has"),
     **dict.fromkeys(("orientation", "quaternion", "quat", "q"), "a quaternion; write roll, pitch and yaw"),
-    **dict.fromkeys(("pressure", "press"), "a pressure; write the depth in metres"),
 }  # fmt: skip
 
 
