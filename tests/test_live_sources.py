@@ -46,7 +46,6 @@ from rovgraph.live.sources import Source, links, open_source, open_sources, with
 from rovgraph.live.sources.doppler import waterlinked
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import StandardInput
-from rovgraph.live.sources.mavlink import MavlinkDecoder, MavlinkOptions
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.source import LONGEST, PATIENCE_S, LinkSource, paced
 from rovgraph.live.warnings import Warnings
