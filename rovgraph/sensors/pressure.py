@@ -19,6 +19,7 @@ from rovgraph.model.config import Config
 from rovgraph.sensors.sensor import Column, Sensor
 
 PRESSURE = Sensor("pressure", (Column("pressure", "pressure"),), may_begin_later=True)  # becomes the stream "depth"
+BY_PRESSURE = "depth by pressure"  # begins what a log notes of it
 STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
 LEAST, MOST = 50_000.0, 108_500.0  # of air where people dive, mountain lakes included [Pa]
 AT_SEA = 87_000.0  # least that was ever measured at sea level [Pa]
@@ -141,7 +142,7 @@ class DepthByPressure:
         how = "as stated" if not self.surface._finds else "found where the vehicle was there"
         what = f"{known.min() / 100.0:.1f} to {known.max() / 100.0:.1f} hPa, {how}" if len(known) else ""
         what = what or f"{STANDARD / 100.0:.1f} hPa, the standard atmosphere, as the vehicle was never there"
-        return f"depth by pressure: at the surface {what}; water of {self._density:.0f} kg/m3"
+        return f"{BY_PRESSURE}: at the surface {what}; water of {self._density:.0f} kg/m3"
 
 
 def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -> tuple[Array, str]:
