@@ -12,7 +12,9 @@ from rovgraph.live.intake import Intake
 from rovgraph.live.message import Reading
 from rovgraph.log import Log
 from rovgraph.model.config import Config
-from rovgraph.sensors.pressure import SurfacePressure, density, depths
+from rovgraph.sensors import SENSORS
+from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.pressure import SurfacePressure, density, depths, waves_at_surface
 
 AIR = 100_300.0
 TIME = np.arange(0.0, 600.0, 0.5)
@@ -146,3 +148,20 @@ def test_the_density_is_stated_or_by_salinity_or_of_the_sea() -> None:
     assert density(Config().changed(sound={"salinity_psu": 0})) == pytest.approx(999.7)
     assert density(Config().changed(sound={"salinity_psu": 35})) == pytest.approx(1026.95, abs=0.1)
     assert density(Config().changed(sound={"salinity_psu": 35}, depth={"density_kgm3": 1010})) == 1010.0
+
+
+def test_waves_are_what_depths_scatter_at_the_surface() -> None:
+    rng = np.random.default_rng(3)
+    depth, _ = dive(begin=200.0, end=400.0)
+    waves = 0.3 * np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME / 5.3) * np.exp(-depth / 5.0)
+    noise = rng.normal(0.0, 0.02, len(TIME))
+    assert waves_at_surface(TIME, depth + waves + noise) == pytest.approx(0.3, rel=0.1)
+    assert waves_at_surface(TIME, depth + noise) == pytest.approx(0.02, rel=0.2)
+    assert waves_at_surface(TIME, depth + 5.0 + waves) == 0.0  # never there
+
+
+def test_waves_add_noise_near_the_surface_alone() -> None:
+    config = Config().changed(depth={"sd_m": 0.04, "waves_m": 0.3})
+    believed = instruments(config, np.zeros(3))["depth"]
+    sd = [float(SENSORS["depth"].standard_deviation(np.array([z]), believed, config)[0]) for z in (-0.1, 5.0, 40.0)]
+    np.testing.assert_allclose(sd, [np.hypot(0.04, 0.3), np.hypot(0.04, 0.3 / np.e), 0.04], rtol=1e-3)

@@ -50,6 +50,7 @@ from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import SoundCorrection
 from rovgraph.sensors.earth_field import BLACKOUT_NT, EarthField, decimal_year, earth_field
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
+from rovgraph.sensors.pressure import waves_at_surface
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
 
@@ -501,6 +502,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     assumptions += [why_not] if why_not else []
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
+    config = _resolve_waves(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams, *layers}
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = _resolve_sound(log, config, assumptions)
@@ -692,6 +694,18 @@ def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
         return config
     imu_section = config.imu.model_copy(update={"noise": noise.model_copy(update=changes)})
     return config.model_copy(update={"imu": imu_section})
+
+
+def _resolve_waves(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """State the waves' pressure at the surface, where depths scatter there far more than they should."""
+    if "depth" not in log or config.depth.waves_m is not None:
+        return config
+    seen, believed = waves_at_surface(log["depth"].time, log["depth"]["depth"]), config.depth.sd_m
+    waves = 0.0
+    if seen > NOISIER * believed:
+        waves = round(float(np.sqrt(seen**2 - believed**2)), 3)
+        assumptions.append(f"depth.waves_m {waves:g}, as depths scatter at the surface; less further down")
+    return config.model_copy(update={"depth": config.depth.model_copy(update={"waves_m": waves})})
 
 
 def _resolve_sound(log: Log, config: Config, assumptions: list[str]) -> Config:

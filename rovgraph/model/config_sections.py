@@ -369,6 +369,9 @@ class Depth(ConfigSection):
         None, description="density of the water [kg/m3], for depth by pressure; null = by sound.salinity_psu, else 1025"
     )
     sd_m: Positive = Field(0.05, description="noise of a depth sample")
+    waves_m: NotNegative | None = Field(
+        None, description="sd of the waves' pressure at the surface, as depth; null = as depths scatter there"
+    )
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is rejected")

@@ -17,6 +17,7 @@ from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, 
 
 AIR_DBAR, SAME_AIR_M = (9.5, 10.5), 0.3  # of the air's pressure, and how much it changes in a dive
 DIVED_M = 2.0  # more than waves
+WAVES_REACH_M = 5.0  # over which the waves' pressure falls by e: g T^2 / (4 pi^2), of a period T of 4.5 s
 DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
 
 
@@ -70,6 +71,12 @@ def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
     return instrument(depth, model, depth.sd_m, ("down",), time_offset="depth_time_offset")
 
 
+def _with_waves(values: Array, believed: Instrument, config: Config) -> Array:
+    """Noise of a depth: near the surface the waves' pressure comes to it."""
+    waves = config.depth.waves_m
+    return np.hypot(believed.sd, waves * np.exp(-max(values[0], 0.0) / WAVES_REACH_M)) if waves else believed.sd
+
+
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
@@ -114,6 +121,7 @@ DEPTH = Sensor(
     (Column("depth", "length"),),
     pressure_sensor,
     refused=_too_deep,
+    standard_deviation=_with_waves,
     once_per_interval=True,
     observes=Observed("position", (2,)),
     may_begin_later=True,

@@ -8,6 +8,7 @@ Reading a log and the online mode take pressures one by one through the same `De
 
 import math
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ FRESH, BY_SALT = 999.7, 0.778  # at 10 deg C [kg/m^3], and by a psu
 BLOCK_S = 5.0  # of pressures that are looked at together
 CALM_PA = 1500.0  # spread of a block in which the vehicle keeps its depth
 SAME_PA = 1000.0  # change of the air's pressure between two stays at the surface: 10 cm of water
+WAVES_S, ENOUGH, BLOCKS = 20.0, 15, 3  # of depths at the surface: length, least samples, least number
+AT_SURFACE_M = 0.5
 GAUGE_PA = 5000.0  # least of a pressure from which the air's was taken off
 
 
@@ -156,6 +159,23 @@ def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -
     if len(known):
         surface[: known[0]] = surface[known[0]]
     return by.depth(pascal, surface, latitude), by.says(surface)
+
+
+def waves_at_surface(time: Array, depth: Array) -> float:
+    """Scatter of depths while the vehicle is at the surface, about their line in each block, sd [m]; 0 = too few.
+
+    Parameters
+    ----------
+    time, depth : shape (n,)
+    """
+    found = []
+    bounds = np.searchsorted(time, np.arange(time[0], time[-1], WAVES_S))
+    for begin, end in pairwise(bounds.tolist()):
+        t, z = time[begin:end], depth[begin:end]
+        if len(t) >= ENOUGH and abs(np.median(z)) < AT_SURFACE_M:
+            line = np.column_stack([np.ones(len(t)), t - t[0]])
+            found.append(float(np.std(z - line @ np.linalg.lstsq(line, z)[0])))
+    return float(np.median(found)) if len(found) >= BLOCKS else 0.0
 
 
 def units_of_air(number: float, units: Mapping[str, float]) -> list[str]:
