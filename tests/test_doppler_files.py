@@ -533,7 +533,7 @@ def test_fixes_beside_the_pings_have_their_own_time_and_tell_how_late_the_instru
     heading = first(recording, "ahrs")
     close(np.rad2deg(heading.columns["ahrs_yaw"]), 120.0)
     close(heading.columns["time"], UNIX + np.arange(20) - 0.25, atol=0.02)
-    assert recording.settings["environment"]["declination_deg"] == 0.0
+    assert recording.settings["heading"] == {"ahrs_reference": "true"}
 
 
 def test_fixes_of_vmdas_are_read_and_those_that_jump_or_lie_at_a_pole_refused(tmp_path):

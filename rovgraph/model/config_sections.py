@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
@@ -93,8 +93,14 @@ class Environment(ConfigSection):
     )
     declination_deg: float = Field(
         0.0,
-        description="magnetic declination, east positive; not given = by place and date for a magnetometer that is the "
-        "only compass, else 0",
+        description="magnetic declination, east positive; not given = by place and date where all compasses in use are "
+        "magnetic, as a magnetometer is and others by heading.*_reference, else 0",
+    )
+    grid: str | None = Field(
+        None, description="map grid of fix_northing, fix_easting and of grid headings, such as EPSG:32632"
+    )
+    convergence_deg: Annotated[float, Field(gt=-180, lt=180)] | None = Field(
+        None, description="grid north from true north, east positive; null = of the grid at the origin"
     )
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
@@ -331,13 +337,22 @@ class Water(ConfigSection):
     )
 
 
+North = Annotated[  # YAML reads true as a truth value
+    Literal["magnetic", "true", "grid"], BeforeValidator(lambda given: "true" if given is True else given)
+]
+_NORTH = "north that {} is relative to: magnetic, true or grid; null = magnetic, by environment.declination_deg or 0"
+
+
 class Heading(ConfigSection):
-    """Heading sources and their noise."""
+    """Heading sources, the north that they are relative to, and their noise."""
 
     sources: tuple[HeadingSource, ...] | None = Field(
         None,
         description="any of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle in the log",
     )
+    ahrs_reference: North | None = Field(None, description=_NORTH.format("the IMU's own heading"))
+    dvl_reference: North | None = Field(None, description=_NORTH.format("the DVL's compass"))
+    vehicle_reference: North | None = Field(None, description=_NORTH.format("the vehicle's own heading"))
     mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
     dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
     ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")

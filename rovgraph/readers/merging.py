@@ -29,6 +29,7 @@ from rovgraph.readers.stamps import by_arrival, put_in_order
 
 OF_INSTRUMENT = (
     "imu",
+    "ahrs",
     "dvl",
     "depth",
     "fix",
@@ -254,7 +255,8 @@ def _settings(
     out: dict[str, tuple[Any, str]] = {}
     for k, (recording, name) in enumerate(zip(recordings, file_names(recordings), strict=True)):
         for path, value in leaves(recording.settings):
-            if path[0] not in OF_INSTRUMENT or feeds.get(path[0]) == k:
+            instrument = path[1].partition("_")[0] if path[0] == "heading" else path[0]  # heading.ahrs_reference
+            if instrument not in OF_INSTRUMENT or feeds.get(instrument) == k:
                 out.setdefault(".".join(path), (value, name))
     stamps = {
         each.channel.sensor: next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))

@@ -16,14 +16,14 @@ import numpy as np
 from rovgraph.diagnosis.check import acoustics
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
-from rovgraph.diagnosis.check.compasses import body_heading
+from rovgraph.diagnosis.check.compasses import body_heading, field_of_place
 from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, ranges
 from rovgraph.diagnosis.check.findings import Finding, Report, Timing, since
 from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
-from rovgraph.inference.initialise import field_by_place
+from rovgraph.inference.initialise import declination_by_place
 from rovgraph.log import Log
 from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
@@ -88,7 +88,7 @@ def _assumptions(log: Log, config: Config, sources: list[str]) -> Iterator[str]:
 
 def _north(log: Log, config: Config) -> str:
     """What is taken for north where no declination is stated."""
-    field = field_by_place(log, config)
+    field = declination_by_place(log, config)
     if field is None or field.horizontal_nt <= BLACKOUT_NT:
         return "magnetic north is taken as north"
     return f"{field.declination_deg:.2f} by WMM2025 at the origin and the date of the log"
@@ -129,6 +129,7 @@ CHECKS: tuple[Check, ...] = (
     turn_rates,
     angles,
     headings,
+    field_of_place,
     own,
     standstill,
     frozen_imu,

@@ -13,6 +13,7 @@ from rovgraph.model.config import Config
 from rovgraph.readers.ardupilot import water_settings
 from rovgraph.readers.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, MavlinkFrames, dialect, usec
 from rovgraph.readers.recording import too_slow
+from rovgraph.sensors.compass import TRUE_NORTH, declination, turns_true_headings
 
 VEHICLE_COMPONENT = 1
 ENOUGH = 20  # samples of an IMU that give its rate
@@ -58,7 +59,7 @@ class MavlinkDecoder:
         self._system = options.system
         self._depth = config.depth
         self._samples: list[float] = []  # when the first ones were made [s]
-        self._declination = np.deg2rad(config.environment.declination_deg)
+        self._declination, self._turns = declination(config, "ahrs"), turns_true_headings(config)
         self._imus = Preferred(IMUS if options.imu is None else (options.imu,), notify)
         self._fix_time: int | None = None
         self._read: dict[str, Callable[[Any, float], Message | None]] = {
@@ -119,9 +120,12 @@ class MavlinkDecoder:
         return self._said_usec(arrival, usec(message), *found)
 
     def _attitude(self, message: Any, arrival: float) -> Message | None:
+        if not self._turns:
+            self._notify("true north", f"ATTITUDE is left out: {TRUE_NORTH}", once=True)
+            return None
         yaw, roll, pitch = READERS["ATTITUDE"](message)[0].values
-        magnetic = float(wrap_angle(yaw - self._declination))  # from true to magnetic north, as a compass has it
-        return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([magnetic, roll, pitch])))
+        heading = float(wrap_angle(yaw - self._declination))  # from true north to that of the log
+        return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([heading, roll, pitch])))
 
     def _parameter(self, message: Any, arrival: float) -> None:
         """Of the autopilot, which sends them on request: what it states of surface and water is told, not used."""

@@ -139,7 +139,8 @@ def _assumption(field: str, words: set[str]) -> str:
     if field in ("fix_north", "fix_east") and not words & _FIX:
         return "taken for a position fix"
     if field in ("heading", "ahrs_yaw", "dvl_heading") and words & {"true", "hdt"}:
-        return "relative to true north by its name: set environment.declination_deg to 0"
+        compass = {"heading": "vehicle", "ahrs_yaw": "ahrs", "dvl_heading": "dvl"}[field]
+        return f"relative to true north by its name: state heading.{compass}_reference: true"
     return ""
 
 

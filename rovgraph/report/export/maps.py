@@ -19,6 +19,7 @@ import pandas as pd
 
 from rovgraph.errors import InputError, in_one_line, warn
 from rovgraph.geometry import Array
+from rovgraph.model.grids import utm_zone
 from rovgraph.report.export.formats import ExportFormat, ExportOptions
 from rovgraph.report.export.track import SHOWN_HZ, Track, ellipse, point_table
 
@@ -262,7 +263,7 @@ def projected(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, st
     import pyproj
 
     if crs.lower() == "utm":
-        crs = f"EPSG:{326 if lat[0] >= 0 else 327}{int((lon[0] + 180.0) // 6.0) % 60 + 1:02d}"
+        crs = utm_zone(float(lat[0]), float(lon[0]))
     try:
         system = pyproj.CRS.from_user_input(crs)
         transform = pyproj.Transformer.from_crs(WGS84, crs, always_xy=True)
