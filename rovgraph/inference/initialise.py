@@ -632,7 +632,7 @@ def _resolve_norths(log: Log, config: Config, assumptions: list[str]) -> Config:
     InputError : a heading relative to a grid that is not known
     """
     sources = heading_sources(config, log.sensors)
-    config = _with_convergence(log, config, sources, assumptions)
+    config = with_convergence(log, config, assumptions)
     magnetic = [source for source in sources if reference(config, source) in ("magnetic", None)]
     field = field_by_place(log) if magnetic else None
     if field is None:
@@ -670,9 +670,14 @@ def _with_declination_sd(config: Config, sources: Sequence[str], sd_deg: float) 
     return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
 
 
-def _with_convergence(log: Log, config: Config, sources: Sequence[str], assumptions: list[str]) -> Config:
-    """Where grid north points, where a compass is relative to it and it is not stated."""
-    of_grid = [source for source in sources if reference(config, source) == "grid"]
+def with_convergence(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Where grid north points, where a compass in use is relative to it and it is not stated.
+
+    Raises
+    ------
+    InputError : the grid or the place is not known
+    """
+    of_grid = [source for source in heading_sources(config, log.sensors) if reference(config, source) == "grid"]
     env = config.environment
     if not of_grid or env.convergence_deg is not None:
         return config

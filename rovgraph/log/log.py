@@ -217,7 +217,14 @@ class Log:
         if self.config is None:
             return
         tables = "columns", "units", "angles", "times", "files", "delay_s"
-        for key in (*tables, "imu.mag", "environment.origin", "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
+        for key in (
+            *tables,
+            "imu.mag",
+            "environment.origin",
+            "environment.grid",
+            "dvl.sound_speed_set_mps",
+            "dvl.sound_speed_mps",
+        ):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
                     f"{self.source}: was read with another value of {key} than the configuration has; "

@@ -17,6 +17,7 @@ from rovgraph.log.stamps import STEP_BACK, mend, require_moving
 from rovgraph.log.streams import (
     DATE,
     LAT_LON,
+    OF_GRID,
     RECEIVED,
     SHIP_LAT_LON,
     SPACING_S,
@@ -44,6 +45,7 @@ from rovgraph.log.units import (
 )
 from rovgraph.model.config import Config, TableSettings
 from rovgraph.model.config_sections import Environment
+from rovgraph.model.grids import lat_lon_of_grid
 from rovgraph.model.origin import EarthOrigin, north_east, origin_in
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -53,6 +55,7 @@ from rovgraph.sensors.water_layer import CELLS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
+GRID_NORTHING, GRID_EASTING = 1e5, 5e4  # no dive is that far from its origin both ways [m]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
 
 Bools = NDArray[np.bool_]
@@ -230,7 +233,52 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
     for name in scale.keys() & cells.keys():
         cells[name] = scale[name](cells[name])
     turn_angles(cells, settings.angles, table.source)
-    return {name: cells[name] for name in names}, names
+    cells = {name: cells[name] for name in names}
+    for lat_lon, of_grid in OF_GRID.items():
+        _on_ellipsoid(cells, names, lat_lon, of_grid, settings.grid, table.source)
+    return cells, names
+
+
+def _on_ellipsoid(
+    cells: dict[str, Array],
+    names: dict[str, str],
+    lat_lon: tuple[str, str],
+    of_grid: tuple[str, str],
+    grid: str | None,
+    source: str,
+) -> None:
+    """Put northing and easting of a map grid in place of latitude and longitude, in cells and names.
+
+    Raises
+    ------
+    InputError : the grid is not stated, or has no such places
+
+    Warns
+    -----
+    DataWarning : north and east are as large as a grid's; latitude and longitude stand beside a grid's places
+    """
+    local = [name.replace("ing", "") for name in of_grid]
+    if all(name in cells and np.isfinite(cells[name]).any() for name in local):
+        north, east = (float(np.nanmedian(np.abs(cells[name]))) for name in local)
+        if north > GRID_NORTHING and east > GRID_EASTING:
+            warn(
+                f"{source}: {local[0]} {north:.0f}, {local[1]} {east:.0f} are places of a map grid, whose north is "
+                f"not true north: name them {of_grid[0]} and {of_grid[1]}, and state environment.grid, as EPSG:32632"
+            )
+    if not {*of_grid} <= cells.keys():
+        return
+    if grid is None:
+        raise InputError(
+            f"{source}: {of_grid[0]} and {of_grid[1]} are of a map grid, which is not stated; state environment.grid, "
+            "such as EPSG:32632 for UTM zone 32 north"
+        )
+    northing, easting = (cells.pop(name) for name in of_grid)
+    written = [names.pop(name) for name in of_grid]
+    if {*lat_lon} & cells.keys():
+        warn(f"{source}: {of_grid[0]} and {of_grid[1]} are ignored beside {' and '.join(lat_lon)}")
+        return
+    for name, values, column in zip(lat_lon, lat_lon_of_grid(grid, easting, northing), written, strict=True):
+        cells[name], names[name] = values, column
 
 
 def _units_of_header(names: Mapping[str, str]) -> dict[str, str]:

@@ -347,7 +347,9 @@ class Config(ConfigSection):
     @property
     def table(self) -> TableSettings:
         """How tables are written that `files` does not name."""
-        return TableSettings(columns=self.columns, units=self.units, angles=self.angles, times=self.times)
+        return TableSettings(
+            columns=self.columns, units=self.units, angles=self.angles, times=self.times, grid=self.environment.grid
+        )
 
     def of_file(self, path: Path) -> FileSettings:
         """How a file is written: by the pattern of `files` that it fits, then by what holds for all.

@@ -649,6 +649,7 @@ class TableSettings(ConfigSection):
     units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)
     angles: Angles = Field(default_factory=dict, description=ANGLES_TEXT)
     times: DateSettings = DateSettings()
+    grid: str | None = Field(None, description="map grid of fix_northing and fix_easting; null = environment.grid")
 
 
 AS_WRITTEN: dict[str, object] = {

@@ -23,7 +23,7 @@ from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
-from rovgraph.inference.initialise import declination_by_place
+from rovgraph.inference.initialise import declination_by_place, with_convergence
 from rovgraph.log import Log
 from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
@@ -160,7 +160,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     config : what is believed of the vehicle; defaults where it is not given
     examined : result of `bridge_jumps` for the log with this configuration
     """
-    config = Config() if config is None else config
+    config = with_convergence(log, Config() if config is None else config, [])
     frozen = frozen_stretches(log, config)
     unfrozen = log_without(log, frozen)
     known: dict[Check, Check] = {
