@@ -25,7 +25,7 @@ ORIGIN = 60.0, 5.5  # 2.5 degrees east of the zone's meridian
     ("east", "convergence", "scale"), [(0.5, 0.43, 0.99961), (1.5, 1.30, 0.99969), (3.0, 2.60, 0.99994)]
 )
 def test_convergence_and_scale_are_those_of_utm(east: float, convergence: float, scale: float) -> None:
-    found = convergence_and_scale(GRID, 60.0, 3.0 + east)
+    found = convergence_and_scale(GRID, *np.array([60.0, 3.0 + east]))
     assert found[0] == pytest.approx(convergence, abs=0.005)
     assert found[1] == pytest.approx(scale, abs=5e-6)
 
@@ -76,7 +76,17 @@ def test_a_grids_places_that_are_called_north_and_east_are_told() -> None:
 @pytest.fixture(scope="module")
 def case() -> Simulated:
     config = falcon(heading={"sources": ["ahrs"]}, calibration={"ahrs_offset": {"sd_deg": 0.2}})
-    return simulated(config, 200.0, 2, imu_rate=25.0, dvl_rate=2.0, ahrs_rate=5.0, fix_interval=1.0, noise=False, style=Style(waves=CALM))
+    return simulated(
+        config,
+        200.0,
+        2,
+        imu_rate=25.0,
+        dvl_rate=2.0,
+        ahrs_rate=5.0,
+        fix_interval=1.0,
+        noise=False,
+        style=Style(waves=CALM),
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,7 +103,7 @@ def test_a_heading_of_a_grid_is_named_by_its_convergence(
 ) -> None:
     """Headings that are grid ones for added = -1, as the true one is that and the convergence."""
     frame = case.dive.log_frame.copy()
-    convergence, _ = convergence_and_scale(GRID, *ORIGIN)
+    convergence, _ = convergence_and_scale(GRID, *np.array(ORIGIN))
     frame["ahrs_yaw"] += np.deg2rad(added * convergence) + np.deg2rad(case.config.environment.declination_deg)
     place = {"origin_lat_deg": ORIGIN[0], "origin_lon_deg": ORIGIN[1], "declination_deg": 0.0, "grid": GRID}
     config = changed(case.config, environment=place, heading={"ahrs_reference": stated}, fix={"sd_m": 0.05})

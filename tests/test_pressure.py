@@ -1,6 +1,7 @@
 """Depth by pressure: the surface, the water, units, and what is told apart by its numbers."""
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from rovgraph.log import Log
 from rovgraph.model.config import Config
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.instruments import instruments
-from rovgraph.sensors.pressure import SurfacePressure, density, depths, waves_at_surface
+from rovgraph.sensors.pressure import OceanProfile, SurfacePressure, density, depths, waves_at_surface
+from rovgraph.sensors.sound import sound_speed
 
 AIR = 100_300.0
 TIME = np.arange(0.0, 600.0, 0.5)
@@ -165,3 +167,43 @@ def test_waves_add_noise_near_the_surface_alone() -> None:
     believed = instruments(config, np.zeros(3))["depth"]
     sd = [float(SENSORS["depth"].standard_deviation(np.array([z]), believed, config)[0]) for z in (-0.1, 5.0, 40.0)]
     np.testing.assert_allclose(sd, [np.hypot(0.04, 0.3), np.hypot(0.04, 0.3 / np.e), 0.04], rtol=1e-3)
+
+
+def test_depths_of_the_standard_ocean_are_those_that_gsw_publishes() -> None:
+    gsw = pytest.importorskip("gsw")
+    dbar = np.array([10.0, 50.0, 125.0, 250.0, 600.0, 1000.0])
+    published = [9.944583, 49.718090, 124.272622, 248.470058, 595.825348, 992.091906]  # check values of z_from_p
+    in_situ = gsw.t_from_CT(35.16504, 0.0, np.arange(0.0, 1300.0, 1.0))
+    depth = -gsw.z_from_p(np.arange(0.0, 1300.0, 1.0), 4.0)
+    standard = OceanProfile(depth, in_situ, np.full(len(depth), 35.0), 4.0)
+    np.testing.assert_allclose(standard.depth(1e4 * dbar), published, atol=1e-4)  # temperatures are linear between
+    assert float(gsw.sound_speed(34.7118, 28.7856, 10.0)) == pytest.approx(1542.426412, abs=1e-6)
+    assert float(gsw.p_from_z(-1000.0, 45.0)) == pytest.approx(1010.6370, abs=5e-5)
+
+
+def test_a_profile_of_the_water_gives_depths_by_teos_10(tmp_path: Path) -> None:
+    gsw = pytest.importorskip("gsw")
+    profile = tmp_path / "ctd.csv"
+    profile.write_text("depth,temperature,salinity\n0,15,30\n20,8,34\n500,4,35\n")
+    config = NORTH.changed(sound={"profile": str(profile)})
+    pressure = AIR + np.concatenate([np.zeros(60), np.linspace(0.0, 4e6, len(TIME) - 60)])
+    log = log_of(pressure, config)
+    assert log.notes[0].endswith("water of sound.profile, by TEOS-10")
+    # independently: hydrostatics with the density of each half metre
+    z = np.arange(0.0, 420.0, 0.5)
+    salt = 35.16504 / 35.0 * np.interp(z, [0.0, 20.0, 500.0], [30.0, 34.0, 35.0])
+    dbar = gsw.p_from_z(-z, 60.0)
+    rho = gsw.rho_t_exact(salt, np.interp(z, [0.0, 20.0, 500.0], [15.0, 8.0, 4.0]), dbar)
+    weight = np.concatenate([[0.0], np.cumsum(0.25 * (rho[1:] + rho[:-1]) * gsw.grav(60.0, dbar)[1:])])
+    np.testing.assert_allclose(log["depth"]["depth"], np.interp(pressure - AIR, weight, z), atol=0.01)
+    stated = log_of(pressure, config.changed(depth={"density_kgm3": 1025}))
+    assert "water of 1025" in stated.notes[0] and abs(stated["depth"]["depth"][-1] - log["depth"]["depth"][-1]) > 0.5
+
+
+def test_the_speed_of_sound_agrees_with_teos_10() -> None:
+    gsw = pytest.importorskip("gsw")
+    for salinity, temperature, depth in ((35.0, 10.0, 0.0), (35.0, 4.0, 1000.0), (5.0, 15.0, 50.0)):
+        p = gsw.p_from_z(-depth, 45.0)
+        absolute = 35.16504 / 35.0 * salinity
+        speed = gsw.sound_speed(absolute, gsw.CT_from_t(absolute, temperature, p), p)
+        assert float(sound_speed(salinity, temperature, depth)) == pytest.approx(float(speed), abs=0.5)

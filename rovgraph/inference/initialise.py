@@ -684,7 +684,7 @@ def with_convergence(log: Log, config: Config, assumptions: list[str]) -> Config
     if env.grid is None or log.origin is None:
         lacking = "environment.grid, such as EPSG:32632" if env.grid is None else "the origin or fixes on Earth"
         raise InputError(f"{of_grid[0]} is relative to a grid's north, which needs {lacking}, or convergence_deg")
-    found, _ = convergence_and_scale(env.grid, *log.origin)
+    found = float(convergence_and_scale(env.grid, *np.array(log.origin))[0])
     assumptions.append(f"environment.convergence_deg {found:.3f}, of {env.grid} at the origin")
     return config.model_copy(update={"environment": env.model_copy(update={"convergence_deg": found})})
 

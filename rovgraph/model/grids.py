@@ -59,8 +59,12 @@ def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, 
 MARGIN_DEG = 6.0  # beyond the area that a grid is made for
 
 
-def convergence_and_scale(grid: str, lat: float, lon: float) -> tuple[float, float]:
+def convergence_and_scale(grid: str, lat: Array, lon: Array) -> tuple[Array, Array]:
     """Where grid north points, clockwise from true north [deg], and metres of the grid for one of the ground.
+
+    Parameters
+    ----------
+    lat, lon : on WGS 84 [deg], shape (n,) or numbers, which gives such
 
     Raises
     ------
@@ -72,8 +76,9 @@ def convergence_and_scale(grid: str, lat: float, lon: float) -> tuple[float, flo
     try:
         factors = pyproj.Proj(system).get_factors(lon, lat, errcheck=True)
     except pyproj.exceptions.ProjError:
-        raise InputError(f"environment.grid {grid}: does not reach to {lat:.3f}, {lon:.3f}") from None
-    return float(factors.meridian_convergence), float(factors.meridional_scale)
+        somewhere = f"{np.ravel(lat)[0]:.3f}, {np.ravel(lon)[0]:.3f}"
+        raise InputError(f"environment.grid {grid}: does not reach to {somewhere}") from None
+    return np.asarray(factors.meridian_convergence), np.asarray(factors.meridional_scale)
 
 
 def utm_zone(lat: float, lon: float) -> str:

@@ -220,7 +220,7 @@ def _of_grid(log: Log, config: Config, sensor: str, line: _Line) -> tuple[str, b
         return "", False
     grid = config.environment.grid or utm_zone(*log.origin)
     try:
-        found, _ = convergence_and_scale(grid, *log.origin)
+        found = float(convergence_and_scale(grid, *np.array(log.origin))[0])
     except InputError:  # no PROJ, or no such place
         return "", False
     turn, north = math.degrees(float(np.angle(line.c))), reference(config, sensor)
