@@ -12,9 +12,11 @@ from rovgraph.diagnosis.check.compasses import field_of_place
 from rovgraph.errors import InputError
 from rovgraph.inference.initialise import initialise
 from rovgraph.log import Log
+from rovgraph.model.calibration import TABLE
 from rovgraph.model.config import Config, mount_matrix, parse_config
+from rovgraph.model.state import State
 from rovgraph.sensors.compass import declination
-from rovgraph.sensors.earth_field import decimal_year, earth_field
+from rovgraph.sensors.earth_field import decimal_year, declination_per_km, earth_field
 
 
 @pytest.mark.parametrize(
@@ -153,3 +155,23 @@ def test_the_magnitude_and_the_dip_check_iron(case: Simulated, factor: float, do
     found = [*field_of_place(altered(log, "mag", field), changed(case.config, units={"mag": "uT"}))]
     assert [finding.level for finding in found] == ["warning" if said else "ok"]
     assert re.search(said, found[0].text)
+
+
+def test_the_declination_changes_along_the_way(case: Simulated) -> None:
+    """At 60 to 70 degrees by some hundredths of a degree a kilometre east, as the model has it 100 km away."""
+    year = decimal_year(UNIX)
+    for latitude in (60.0, 70.0):
+        north, east = declination_per_km(latitude, 10.0, year)
+        here = earth_field(latitude, 10.0, 0.0, year).declination_deg
+        there = earth_field(latitude, 10.0 + 100.0 / 111.2 / np.cos(np.deg2rad(latitude)), 0.0, year).declination_deg
+        assert east == pytest.approx((there - here) / 100.0, abs=5e-4) and 0.006 < east < 0.016
+        assert abs(north) < 0.01
+    log = shifted(without(case.log, "ahrs", "dvl_heading"), UNIX)
+    initial = initialise(log, unstated(case.config))
+    model: Any = initial.instruments["mag"].model
+    exact = {name: np.zeros(TABLE[name].dim) for name in model.calibration}
+    away = State(np.eye(3)[None], np.array([[0.0, 1e5, 0.0]]), np.zeros((1, 3)), np.zeros((1, 6)), exact)
+    field, _ = model.predict(away, np.zeros((1, 3)))
+    seen = model.R_bs @ field[0]
+    expected = declination_per_km(60.0, 10.0, year)[1] * 100.0 + earth_field(60.0, 10.0, 0.0, year).declination_deg
+    assert np.rad2deg(np.arctan2(seen[1], seen[0])) == pytest.approx(expected, abs=0.01)

@@ -50,7 +50,14 @@ from rovgraph.sensors import SENSORS, innovation
 from rovgraph.sensors.compass import reference
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import SoundCorrection
-from rovgraph.sensors.earth_field import BLACKOUT_NT, CAUTION_NT, EarthField, decimal_year, earth_field
+from rovgraph.sensors.earth_field import (
+    BLACKOUT_NT,
+    CAUTION_NT,
+    EarthField,
+    decimal_year,
+    declination_per_km,
+    earth_field,
+)
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
 from rovgraph.sensors.pressure import waves_at_surface
 
@@ -616,6 +623,14 @@ def field_by_place(log: Log) -> EarthField | None:
     return earth_field(*log.origin, 0.0, decimal_year(log.start))
 
 
+def slope_by_place(log: Log) -> tuple[float, float]:
+    """Change of the declination by a kilometre north and east where a dive begins [deg/km]; 0 where it is not known."""
+    if log.origin is None:
+        return 0.0, 0.0
+    north, east = declination_per_km(*log.origin, decimal_year(log.start))
+    return round(north, 5), round(east, 5)
+
+
 def declination_by_place(log: Log, config: Config) -> EarthField | None:
     """The field that the declination is taken from: where none is stated, and no compass may have taken it already."""
     norths = [reference(config, source) for source in heading_sources(config, log.sensors)]
@@ -648,10 +663,13 @@ def _resolve_norths(log: Log, config: Config, assumptions: list[str]) -> Config:
     expired = ", which ends before that date: use a newer rovgraph, or state it" if field.expired else ""
     if (taken := declination_by_place(log, config)) is not None and field.horizontal_nt >= BLACKOUT_NT:
         changes["declination_deg"] = round(taken.declination_deg, 2)
+        slope = config.environment.declination_per_km_deg or slope_by_place(log)
+        changes["declination_per_km_deg"] = slope
         config = _with_declination_sd(config, magnetic, taken.declination_sd_deg)
         assumptions.append(
             f"environment.declination_deg {taken.declination_deg:.2f} within {taken.declination_sd_deg:.1f} deg, by "
-            f"WMM2025 at the origin and the date of the log{expired}"
+            f"WMM2025 at the origin and the date of the log, by km north and east "
+            f"{slope[0]:+.4f} and {slope[1]:+.4f} deg{expired}"
         )
     if "mag" in sources and config.environment.dip_deg is None:
         changes["dip_deg"] = round(field.dip_deg, 2)

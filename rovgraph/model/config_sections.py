@@ -96,6 +96,9 @@ class Environment(ConfigSection):
         description="magnetic declination, east positive; not given = by place and date where all compasses in use are "
         "magnetic, as a magnetometer is and others by heading.*_reference, else 0",
     )
+    declination_per_km_deg: tuple[float, float] | None = Field(
+        None, description="its change by a kilometre north and east; null = as the declination, by place and date, or 0"
+    )
     grid: str | None = Field(
         None, description="map grid of fix_northing, fix_easting and of grid headings, such as EPSG:32632"
     )
