@@ -304,7 +304,7 @@ class Config(ConfigSection):
     times: DateSettings = DateSettings()
     files: dict[str, FileSettings] = Field(
         default_factory=dict,
-        description="name or pattern of a file: its own columns, units, angles, times, delay_s",
+        description="name or pattern of a file: its own columns, units, angles, times, grid, delay_s",
     )
     delay_s: Delays = Field(
         {},
