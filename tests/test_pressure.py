@@ -207,3 +207,9 @@ def test_the_speed_of_sound_agrees_with_teos_10() -> None:
         absolute = 35.16504 / 35.0 * salinity
         speed = gsw.sound_speed(absolute, gsw.CT_from_t(absolute, temperature, p), p)
         assert float(sound_speed(salinity, temperature, depth)) == pytest.approx(float(speed), abs=0.5)
+
+
+def test_a_unit_of_the_header_is_judged_as_a_stated_one() -> None:
+    _, pressure = dive()
+    with pytest.warns(rg.DataWarning, match=r"the unit is psi: state units: \{pressure: psi\}"):
+        Log.from_arrays({"time": TIME, "pressure [bar]": pressure / 6894.757})

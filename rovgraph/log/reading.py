@@ -104,7 +104,7 @@ def read_streams(
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
     if not keep_pressure:
-        _add_depth(found, config, origin, source, [] if notes is None else notes)
+        _add_depth(found, config, origin, source, [] if notes is None else notes, names)
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
@@ -114,8 +114,10 @@ def read_streams(
     return found | with_sound_speed(found, found, config), origin
 
 
-def _add_depth(found: dict[str, Stream], config: Config, origin: Origin, source: str, notes: list[str]) -> None:
-    """Turn pressures into depths, or leave them out beside depths.
+def _add_depth(
+    found: dict[str, Stream], config: Config, origin: Origin, source: str, notes: list[str], names: Iterable[str]
+) -> None:
+    """Turn pressures into depths, or leave them out beside depths; one of the names of columns may state their unit.
 
     Raises
     ------
@@ -131,7 +133,9 @@ def _add_depth(found: dict[str, Stream], config: Config, origin: Origin, source:
         warn(f"{source}: depth is ignored beside pressure; depth.source: depth uses it instead")
     pascal = pressure["pressure"]
     if config.depth.surface_hpa is None:
-        factor = UNITS["pressure"].get(config.units.get("pressure", ""), 1.0)
+        written = next((name for name in names if name_and_bracket(name)[0] == PRESSURE.name), PRESSURE.name)
+        unit = config.units.get(PRESSURE.name) or _units_of_header({PRESSURE.name: written}).get(PRESSURE.name, "Pa")
+        factor = UNITS["pressure"][unit]
         for text in complaints(pascal, factor, UNITS["pressure"], source):
             warn(text)
     below, said = depths(pressure.time, pascal, config, None if origin is None else origin[0])

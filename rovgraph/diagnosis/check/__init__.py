@@ -29,6 +29,7 @@ from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.sensors import SENSORS, Level
+from rovgraph.sensors.compass import reference
 from rovgraph.sensors.earth_field import BLACKOUT_NT
 from rovgraph.sensors.instruments import heading_sources
 
@@ -90,7 +91,10 @@ def _north(log: Log, config: Config) -> str:
     """What is taken for north where no declination is stated."""
     field = declination_by_place(log, config)
     if field is None or field.horizontal_nt <= BLACKOUT_NT:
-        return "magnetic north is taken as north"
+        unstated = [source for source in heading_sources(config, log.sensors) if reference(config, source) is None]
+        key = f"heading.{unstated[0].partition('_')[0]}_reference" if unstated else ""
+        why = f"{key} is not given" if unstated else "the log has no place or no date"
+        return f"magnetic north is taken as north, as {why}"
     return f"{field.declination_deg:.2f} by WMM2025 at the origin and the date of the log"
 
 
