@@ -13,7 +13,7 @@ it then begins.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -659,7 +659,7 @@ def _resolve_norths(log: Log, config: Config, assumptions: list[str]) -> Config:
         return config.model_copy(update={"heading": config.heading.model_copy(update={"sources": kept})})
     if field.horizontal_nt < CAUTION_NT:
         assumptions.append(f"compasses show little here: {weak}, and storms turn them by many degrees")
-    changes = {}
+    changes: dict[str, Any] = {}
     expired = ", which ends before that date: use a newer rovgraph, or state it" if field.expired else ""
     if (taken := declination_by_place(log, config)) is not None and field.horizontal_nt >= BLACKOUT_NT:
         changes["declination_deg"] = round(taken.declination_deg, 2)

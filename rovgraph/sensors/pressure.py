@@ -140,9 +140,11 @@ class OceanProfile:
 
 @cache
 def _ocean(profile: SoundSpeedProfile, latitude: float) -> OceanProfile | None:
-    """Of a profile with temperature and salinity; None where GSW is not installed."""
+    """Of a profile; None where it has no temperature and salinity, or GSW is not installed."""
+    if profile.water is None:
+        return None
     try:
-        return OceanProfile(profile.depth, *profile.water, latitude)  # type: ignore[misc]
+        return OceanProfile(profile.depth, profile.water[0], profile.water[1], latitude)
     except ImportError:
         return None
 
