@@ -1,10 +1,12 @@
 """Depth by pressure: the surface, the water, units, and what is told apart by its numbers."""
 
 from collections import Counter
-from pathlib import Path
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 import rovgraph as rg
 from rovgraph.geometry import Array
@@ -17,6 +19,7 @@ from rovgraph.sensors import SENSORS
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.pressure import OceanProfile, SurfacePressure, density, depths, waves_at_surface
 from rovgraph.sensors.sound import sound_speed
+from rovgraph.simulate import Path, Truth, simulate
 
 AIR = 100_300.0
 TIME = np.arange(0.0, 600.0, 0.5)
@@ -181,7 +184,7 @@ def test_depths_of_the_standard_ocean_are_those_that_gsw_publishes() -> None:
     assert float(gsw.p_from_z(-1000.0, 45.0)) == pytest.approx(1010.6370, abs=5e-5)
 
 
-def test_a_profile_of_the_water_gives_depths_by_teos_10(tmp_path: Path) -> None:
+def test_a_profile_of_the_water_gives_depths_by_teos_10(tmp_path: FilePath) -> None:
     gsw = pytest.importorskip("gsw")
     profile = tmp_path / "ctd.csv"
     profile.write_text("depth,temperature,salinity\n0,15,30\n20,8,34\n500,4,35\n")
@@ -213,3 +216,34 @@ def test_a_unit_of_the_header_is_judged_as_a_stated_one() -> None:
     _, pressure = dive()
     with pytest.warns(rg.DataWarning, match=r"the unit is psi: state units: \{pressure: psi\}"):
         Log.from_arrays({"time": TIME, "pressure [bar]": pressure / 6894.757})
+
+
+@pytest.mark.slow
+def test_the_depth_follows_the_surface_through_a_tide() -> None:
+    """Three hours with 1 m of tide and stays at the surface at begin, middle and end, where the air has changed."""
+    t = np.arange(0.0, 10_801.0, 10.0)
+    legs = np.where((t // 150.0).astype(int) % 2 == 0, 0.3, 0.3 + np.pi)
+    yaw = gaussian_filter1d(legs, 1.0, mode="nearest")
+    place = np.cumsum(4.0 * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
+    under = np.ones(len(t))
+    for begin, end in ((-600.0, 120.0), (5340.0, 5460.0), (10_680.0, 11_400.0)):
+        under *= np.clip(np.maximum(begin - t, t - end) / 120.0, 0.0, 1.0)
+    below = gaussian_filter1d(under * (15.0 + 3.0 * np.sin(2.0 * np.pi * t / 900.0)), 2.0, mode="nearest")
+    path = Path.through(t, np.column_stack([place, below - tide(t)]), np.column_stack([0 * t, 0 * t, yaw]), rest=False)
+    config = NORTH.changed(heading={"sources": ["ahrs"]}, calibration={"ahrs_offset": {"estimate": False}})
+    right = {"depth_offset": np.zeros(1), "depth_scale": np.zeros(1)}
+    truth = Truth(config, calibration=right, imu_rate=10.0, dvl_rate=1.0, depth_rate=1.0, ahrs_rate=5.0)
+    dived = simulate(path, truth, np.random.default_rng(1))
+    frame = dived.log_frame.copy()
+    gravity = normal_gravity(np.deg2rad(60.0))
+    frame["pressure"] = AIR + 0.05 * frame["time"] + 1025.0 * gravity * (frame.pop("depth") + tide(frame["time"]))
+    track = rg.smooth(Log.from_frame(frame, config), config, "smoothed").smoothed.trajectory
+    truly = np.interp(track.time, dived.truth.time, dived.truth.p_n[:, 2]) + tide(track.time)
+    error = track.p_n[:, 2] - truly
+    assert float(np.sqrt(np.mean(error**2))) < 0.1
+    assert np.mean((error / track.p_sd[:, 2]) ** 2) < 1.5
+
+
+def tide(time: Any) -> Any:
+    """1 m in three hours [m]."""
+    return 0.5 - 0.5 * np.cos(2.0 * np.pi * time / 21_600.0)
