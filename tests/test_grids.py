@@ -1,14 +1,20 @@
 """Map grids: fixes in northing and easting, and headings relative to grid north."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 from dives import Simulated, changed, falcon, simulated
+from wire import Heard
 
 import rovgraph as rg
 from rovgraph.diagnosis.check.fixes import track
 from rovgraph.errors import InputError
 from rovgraph.inference.initialise import with_convergence
+from rovgraph.live.message import GEODETIC
+from rovgraph.live.sources.json_lines import json_lines
+from rovgraph.live.sources.source import Chunk
 from rovgraph.log import Log
 from rovgraph.model.config import Config
 from rovgraph.model.grids import convergence_and_scale, utm_zone
@@ -112,3 +118,16 @@ def test_a_heading_of_a_grid_is_named_by_its_convergence(
     assert len(found) == 1
     assert said in found[0].text if said else "convergence" not in found[0].text
     assert found[0].level == ("warning" if said else "ok")
+
+
+def test_a_place_of_a_grid_online_is_one_on_earth() -> None:
+    row = table().iloc[0]
+    line = json.dumps({"time": 1.0, "fix_northing": row["fix_northing"], "fix_easting": row["fix_easting"]}).encode()
+    heard = Heard()
+    (message,) = json_lines("-", heard, Config().changed(environment={"grid": GRID})).feed(Chunk(line + b"\n", 0.0))
+    (reading,) = message.readings
+    assert reading.sensor == GEODETIC
+    lat, lon, _ = reading.values.tolist()
+    np.testing.assert_allclose([lat, lon], [row["lat"], row["lon"]], atol=1e-9)
+    assert [*json_lines("-", heard, Config()).feed(Chunk(line + b"\n", 0.0))] == []
+    assert heard.kinds == {"no grid": 1}

@@ -4,6 +4,7 @@ The convergence is where grid north points, clockwise from true north; with it a
 true one: true = grid + convergence. Computed by PROJ, which the extra ``gis`` brings.
 """
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from rovgraph.geometry import Array
 ELLIPSOID = "EPSG:4326"
 
 
-def _system(grid: str) -> Any:
+@cache
+def _system(grid: str) -> tuple[Any, Any]:
+    """The grid, and what takes its places to the ellipsoid."""
     try:
         import pyproj
     except ImportError:
@@ -26,7 +29,7 @@ def _system(grid: str) -> Any:
         raise InputError(f"environment.grid {grid!r}: is not known; give one such as EPSG:32632, UTM zone 32") from None
     if not system.is_projected:
         raise InputError(f"environment.grid {grid!r}: is in degrees, no grid; give one such as EPSG:32632, UTM zone 32")
-    return system
+    return system, pyproj.Transformer.from_crs(system, ELLIPSOID, always_xy=True)
 
 
 def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, Array]:
@@ -36,13 +39,10 @@ def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, 
     ------
     InputError : no such grid; places that it does not have
     """
-    system = _system(grid)
-    import pyproj
-
+    system, transformer = _system(grid)
     known = np.isfinite(easting) & np.isfinite(northing)
     lon, lat = (np.full(len(easting), np.nan) for _ in range(2))
-    transform = pyproj.Transformer.from_crs(system, ELLIPSOID, always_xy=True)
-    lon[known], lat[known] = transform.transform(easting[known], northing[known])
+    lon[known], lat[known] = transformer.transform(easting[known], northing[known])
     area = system.area_of_use
     if area is not None and known.any():
         here = float(np.median(lat[known])), float(np.median(lon[known]))
@@ -70,7 +70,7 @@ def convergence_and_scale(grid: str, lat: Array, lon: Array) -> tuple[Array, Arr
     ------
     InputError : no such grid; it does not reach there
     """
-    system = _system(grid)
+    system, _ = _system(grid)
     import pyproj
 
     try:
