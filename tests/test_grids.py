@@ -125,9 +125,8 @@ def test_a_place_of_a_grid_online_is_one_on_earth() -> None:
     line = json.dumps({"time": 1.0, "fix_northing": row["fix_northing"], "fix_easting": row["fix_easting"]}).encode()
     heard = Heard()
     (message,) = json_lines("-", heard, Config().changed(environment={"grid": GRID})).feed(Chunk(line + b"\n", 0.0))
-    (reading,) = message.readings
-    assert reading.sensor == GEODETIC
-    lat, lon, _ = reading.values.tolist()
-    np.testing.assert_allclose([lat, lon], [row["lat"], row["lon"]], atol=1e-9)
+    ((sensor, place),) = message.readings
+    assert sensor == GEODETIC
+    np.testing.assert_allclose(place[:2], [row["lat"], row["lon"]], atol=1e-9)
     assert [*json_lines("-", heard, Config()).feed(Chunk(line + b"\n", 0.0))] == []
     assert heard.kinds == {"no grid": 1}
