@@ -144,7 +144,7 @@ def dataflash_of(frame: pd.DataFrame, declination: float, surface: float, units:
             writer.add("ATT", us, roll, pitch, round(100.0 * yaw) % 36000)
         if "depth" in row:
             writer.add("BARO", us, 0, 0.0, 99_000.0, 4700, round(1e-3 * us))  # within the hull
-            writer.add("BARO", us, 1, 0.0, surface + 1024.0 * 9.80665 * row["depth"], 1000, round(1e-3 * us))
+            writer.add("BARO", us, 1, 0.0, surface + 1024.0 * 9.81 * row["depth"], 1000, round(1e-3 * us))
         if "dvl_vx" in row:
             dt = 0.1 if last_ping is None else time - last_ping
             last_ping = time
@@ -225,7 +225,7 @@ def autopilot_messages(frame: pd.DataFrame, declination: float, surface: float) 
                 ),
             )
         if "depth" in row:
-            hpa = 0.01 * (surface + 1024.0 * 9.80665 * row["depth"])
+            hpa = 0.01 * (surface + 1024.0 * 9.81 * row["depth"])
             yield time, mavlink.MAVLink_scaled_pressure2_message(round(1e3 * time), hpa, 0.0, 1000)
         if "dvl_vx" in row:
             delta = [0.1 * row[f"dvl_v{a}"] for a in "xyz"]

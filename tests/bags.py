@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rovgraph.readers.rosbag import ALL_DEFINITIONS
 
 START = 1_700_000_000.0
-SURFACE, SEA, GRAVITY = 101_325.0, 1025.0, 9.80665
+SURFACE, SEA, GRAVITY = 101_325.0, 1025.0, 9.81
 FORMS = ("ros1", "sqlite", "mcap")
 
 

@@ -540,6 +540,33 @@ def test_a_depth_that_is_zeroed_under_way_does_not_blame_the_dvl(sound, by):
     assert ("its zero was probably set under water" in messages(zeroed, sensor="depth")) == (by < 0.0)
 
 
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1.0 / 9.945, "bar"), (1.4585, "psi"), (10.055, "kPa"), (10_055.0, "Pa"), (1e3, "mm")]
+)
+def test_a_depth_that_is_a_pressure_or_in_another_unit_is_named_by_the_dvls_way(sound, factor, unit):
+    said = messages(scaled(sound, "depth", slice(0, 1), factor), sensor="depth")
+    column = "depth" if unit == "mm" else "pressure"
+    assert f"state units: {{{column}: {unit}}}" in said
+    assert ("name it pressure" in said) == (column == "pressure")
+
+
+def test_a_pressure_in_the_wrong_unit_is_named_by_the_dvls_way(sound):
+    """Gauge, so that no air shows it: bar that was taken for dbar."""
+    config = Config().changed(units={"pressure": "dbar"}, depth={"surface_hpa": 0})
+    log = replace(scaled(sound, "depth", slice(0, 1), 0.1), notes=("depth by pressure: ...",))
+    assert "if it is in bar, state units: {pressure: bar}" in messages(log, config, sensor="depth")
+
+
+def test_a_depth_that_begins_and_ends_with_the_airs_weight_is_named(sound):
+    def dive_from_the_surface(data, time):
+        data[:, 0] = 10.13 + 2.0 * np.clip(np.minimum(time - 20.0, 380.0 - time) / 20.0, 0.0, 2.0)
+
+    absolute = changed(sound, "depth", dive_from_the_surface)
+    assert "state units: {pressure: dbar}" in messages(absolute, sensor="depth")
+    stated = Config().changed(depth={"surface_hpa": 0})
+    assert "remove depth.surface_hpa: 0" in messages(absolute, stated, sensor="depth")
+
+
 def test_invalid_zeros_are_not_frozen(sound):
     def lose(data, time):
         data[(time >= 100) & (time <= 120), :4] = 0.0

@@ -103,8 +103,8 @@ def test_stamps_of_any_type_become_seconds(stored, tmp_path):
 def test_a_log_that_declares_no_units_has_those_of_the_documentation_and_says_so(dive, tmp_path):
     data = dataflash_of(short_dive(DECLINATION_DEG), 0.0, SURFACE, units=False)
     recording = read(data, tmp_path)
-    for sensor in ("imu", "mag", "ahrs", "depth", "dvl"):
-        column = {"imu": "gyr_z", "mag": "mag_x", "ahrs": "ahrs_roll", "depth": "depth", "dvl": "dvl_vx"}[sensor]
+    for sensor in ("imu", "mag", "ahrs", "dvl"):
+        column = {"imu": "gyr_z", "mag": "mag_x", "ahrs": "ahrs_roll", "dvl": "dvl_vx"}[sensor]
         np.testing.assert_allclose(first(recording, sensor).columns[column], dive[sensor][column], atol=0.06)
     assert any("declares no unit of" in note and "MAG.MagX" in note for note in recording.notes)
 
@@ -149,18 +149,20 @@ def test_depth_is_of_the_primary_barometer_and_its_own_surface(tmp_path):
     recording = read(writer.bytes(), tmp_path)
     depth = first(recording, "depth")
     assert depth.source.startswith("BARO 1")
-    np.testing.assert_allclose(depth.columns["depth"], np.arange(10), atol=1e-5)
-    assert first(read(writer.bytes(), tmp_path, depth="0"), "depth").source.startswith("BARO 0")
+    np.testing.assert_allclose(depth.columns["pressure"], 100_000.0 + 9806.65 * np.arange(10), rtol=1e-7)
+    assert recording.settings["depth"] == {"surface_hpa": 1000.0, "density_kgm3": 1000.0}
+    other = read(writer.bytes(), tmp_path, depth="0")
+    assert first(other, "depth").source.startswith("BARO 0") and other.settings["depth"]["surface_hpa"] == 990.0
     with pytest.raises(InputError, match="choose one of: BARO 1, BARO 0"):
         read(writer.bytes(), tmp_path, depth="7")
 
 
-def test_an_impossible_surface_pressure_becomes_no_depth_of_zero(tmp_path):
+def test_a_surface_pressure_that_no_air_has_is_not_stated(tmp_path):
     writer = imus(30).parameters(BARO_PRIMARY=0, BARO1_GND_PRESS=181_800.0, BARO_SPEC_GRAV=1.0)
     for k in range(100):
         writer.add("BARO", 1e5 * k, 0, 0, 101_000.0 + 9806.65 * 8.0 * min(k / 50, 1), 0, 100 * k)
     recording = read(writer.bytes(), tmp_path)
-    assert first(recording, "depth").columns["depth"][-1] == pytest.approx(8.0, abs=0.2)
+    assert recording.settings["depth"] == {"density_kgm3": 1000.0}
     assert any("1818 hPa" in warning for warning in recording.warnings)
 
 
@@ -179,7 +181,7 @@ def test_parameters_that_change_count_as_they_were_first(tmp_path):
     writer.parameters(BARO1_GND_PRESS=109_806.65, COMPASS_DEC=0.2)
     writer.add("BARO", 1e6, 0, 0, 109_806.65, 0, 1000).add("ATT", 1e6, 0, 0, 0)
     recording = read(writer.bytes(), tmp_path)
-    assert first(recording, "depth").columns["depth"][0] == pytest.approx(1.0, abs=1e-4)
+    assert recording.settings["depth"]["surface_hpa"] == 1000.0
     assert first(recording, "ahrs").columns["ahrs_yaw"][0] == pytest.approx(-0.1)
     assert sum("changes from" in note for note in recording.notes) == 2
 
@@ -436,7 +438,7 @@ def test_a_real_log_becomes_a_log(real):
         "thruster": 237,
     }
     assert np.median(chosen["imu"].columns["acc_z"]) == pytest.approx(-9.8, abs=0.05)
-    assert np.ptp(chosen["depth"].columns["depth"]) < 0.02  # on a bench
+    assert np.ptp(chosen["depth"].columns["pressure"]) < 200.0  # on a bench
     assert recording.settings["environment"]["declination_deg"] == pytest.approx(15.0)
     assert any("MAG 0: magnitude 91 uT" in warning for warning in recording.warnings)
     log = Log.from_arrays(*(channel.columns for channel in chosen.values()))

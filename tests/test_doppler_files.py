@@ -423,8 +423,9 @@ def test_an_ad2cp_file_agrees_with_its_makers_own_decoding():
     np.testing.assert_allclose(np.rad2deg(tilt["roll"]), made["BottomTrack_Roll"], atol=1e-3)
     days = made["BottomTrack_Time"] - 719529.0  # MATLAB's days
     np.testing.assert_allclose(heading["time"], 86400.0 * days, atol=1e-3)
-    depth = first(recording, "depth").columns["depth"]
-    np.testing.assert_allclose(depth * 9806.65, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
+    pascal = first(recording, "depth").columns["pressure"]
+    np.testing.assert_allclose(pascal, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
+    assert recording.settings["depth"] == {"surface_hpa": 0.0}
     assert not first(recording, "dvl").columns["dvl_valid"].any()  # on a bench: figures of merit are none
     assert (made["BottomTrack_VelZ1"] < -11.0).all()  # stale, and refused
     assert "dvl_beams" not in recording.tables
@@ -532,7 +533,7 @@ def test_fixes_beside_the_pings_have_their_own_time_and_tell_how_late_the_instru
     heading = first(recording, "ahrs")
     close(np.rad2deg(heading.columns["ahrs_yaw"]), 120.0)
     close(heading.columns["time"], UNIX + np.arange(20) - 0.25, atol=0.02)
-    assert recording.settings["environment"]["declination_deg"] == 0.0
+    assert recording.settings["heading"] == {"ahrs_reference": "true"}
 
 
 def test_fixes_of_vmdas_are_read_and_those_that_jump_or_lie_at_a_pole_refused(tmp_path):

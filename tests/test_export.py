@@ -129,7 +129,7 @@ def test_gpx_is_read_back_by_gdal(tmp_path):
 @pytest.mark.parametrize("name", ["gpkg", "shp"])
 @pytest.mark.parametrize("crs", [None, "utm", "EPSG:25831"])
 def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, crs):
-    geopandas = pytest.importorskip("geopandas")
+    geopandas, pyproj = pytest.importorskip("geopandas"), pytest.importorskip("pyproj")
     pytest.importorskip("pyogrio")
     path = written(name, tmp_path, ExportOptions(crs=crs))
     layer = geopandas.read_file(path if name == "gpkg" else path / "track.shp")
@@ -137,6 +137,13 @@ def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, cr
     degrees = layer.to_crs(4326).geometry
     assert off(degrees.y, degrees.x, layer["time"]) < WITHIN_M
     assert layer["heading_sd"].iloc[-1] > 0.0
+    assert ("grid_north" in layer) == (crs is not None)
+    if crs is not None:  # the turn from the meridian to the grid's lines, by two points of the grid
+        point, to_grid = layer.iloc[0], pyproj.Transformer.from_crs(4326, layer.crs, always_xy=True)
+        (x0, y0), (x1, y1) = (to_grid.transform(point["lon"], point["lat"] + d) for d in (-1e-3, 1e-3))
+        assert point["grid_north"] == pytest.approx(-np.rad2deg(np.arctan2(x1 - x0, y1 - y0)), abs=1e-4)
+        ground = pyproj.Geod(ellps="WGS84").inv(point["lon"], point["lat"] - 1e-3, point["lon"], point["lat"] + 1e-3)[2]
+        assert point["grid_scale"] == pytest.approx(np.hypot(x1 - x0, y1 - y0) / ground, abs=1e-6)
 
 
 def test_nmea_is_read_back_and_no_sentence_is_too_long(tmp_path):

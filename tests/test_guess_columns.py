@@ -282,6 +282,26 @@ def test_a_name_means_a_column_of_a_log(name, field, unit):
     assert (meaning(name).field, meaning(name).unit) == (field, unit)
 
 
+@pytest.mark.parametrize(
+    ("name", "factor", "beside", "expected"),
+    [
+        ("Pressure", 1e5, False, ("bar", "likely")),
+        ("Pressure", 6894.757, False, ("psi", "likely")),
+        ("press_dbar", 1e4, False, ("dbar", "sure")),
+        ("Pressure", 3e4, False, ("Pa", "unsure")),
+        ("Pressure", 1e5, True, None),
+    ],
+)
+def test_a_pressure_is_in_the_unit_that_makes_its_least_the_airs(frame, tmp_path, name, factor, beside, expected):
+    table = frame[["time", *ACC, *GYR]]
+    time = table["time"] - table["time"].iloc[0]
+    pascal = 101_000.0 + 40_000.0 * np.clip(time / time.max() - 0.2, 0.0, 1.0)
+    table = table.assign(**{name: pascal / factor} | ({"depth": 4.0 * time} if beside else {}))
+    guess = rg.guess_columns(written(table, tmp_path))
+    found = [(each.unit, each.sureness) for each in guess.columns if each.column == name]
+    assert found == ([expected] if expected else []) and (guess.left.get(name) is not None) == beside
+
+
 def test_of_two_imus_one_is_proposed_and_the_other_named(frame, tmp_path):
     table = frame[["time", *ACC, *GYR]].rename(columns={n: f"imu1.{n}" for n in (*ACC, *GYR)})
     table = table.assign(**{f"imu2.{n}": frame[n] for n in ACC})

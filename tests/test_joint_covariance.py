@@ -264,8 +264,8 @@ def test_other_estimates_have_none(dive):
 def test_400_dives_scatter_as_it_says():
     """With considered variables drawn from their priors, estimated ones too, and a start that is off.
 
-    The IMU is at the origin. Off it, the gyro's noise is in the DVL's prediction and in the velocity of the arm, counted
-    as if independent: the sd of the Falcon's vertical velocity is then 13 % too wide.
+    The IMU is at the origin. Off it, the gyro's noise is in the DVL's prediction and in the velocity of the arm, and
+    counted as if independent: the sd of the Falcon's vertical velocity is then 13 % too wide.
     """
     plain = {sensor: {"loss": "none"} for sensor in ("dvl", "heading", "depth")}
     config, rng, errors = falcon(**plain, **CONSIDERED, **AT_IMU), np.random.default_rng(5), []

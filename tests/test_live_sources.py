@@ -38,15 +38,14 @@ from wire import (
     vision,
 )
 
+import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.live.files import KnownSources
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.session import Feed
-from rovgraph.live.sources import Source, links, open_source, open_sources
+from rovgraph.live.sources import Source, links, open_source, open_sources, with_depth_options
 from rovgraph.live.sources.doppler import waterlinked
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import StandardInput
-from rovgraph.live.sources.mavlink import MavlinkDecoder, MavlinkOptions
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.source import LONGEST, PATIENCE_S, LinkSource, paced
 from rovgraph.live.warnings import Warnings
@@ -625,41 +624,31 @@ def test_attitude_is_turned_from_true_to_magnetic_north(heard):
     assert message.stamp == 2.5
 
 
-def test_depth_is_from_the_first_pressure_or_from_the_surface_that_is_given(heard):
-    ten_metres = 1000.0 * 9.80665 * 10.0 / 100.0
-    first = decoded(autopilot(heard), packed(pressure2(hpa=1000.0)), packed(pressure2(hpa=1000.0 + ten_metres)))
-    np.testing.assert_allclose(by_sensor(first)["depth"], [[0.0], [10.0]], atol=1e-4)
-    assert heard.kinds == {"surface": 1}
-    given = decoded(autopilot(heard, surface=900.0, density=1025.0), packed(pressure2(hpa=900.0 + ten_metres)))
-    np.testing.assert_allclose(by_sensor(given)["depth"], [[10.0 / 1.025]], atol=1e-4)
+def test_pressure_stays_pressure(heard):
+    said = decoded(autopilot(heard), packed(pressure2(hpa=1818.0)))
+    np.testing.assert_allclose(by_sensor(said)["pressure"], [[181_800.0]])
 
 
 def parameter(name: str, value: float):
     return mavlink.MAVLink_param_value_message(name.encode(), value, 9, 1, 0)
 
 
-def test_depth_is_by_the_parameters_that_the_autopilot_tells_as_from_a_recording(heard):
+def test_what_the_autopilot_states_of_surface_and_water_is_told_where_the_configuration_is_silent(heard):
     told = [packed(parameter("BARO2_GND_PRESS", 99_000.0)), packed(parameter("BARO_SPEC_GRAV", 1.025))]
-    said = decoded(autopilot(heard), *told, packed(pressure2(hpa=990.0 + 1025.0 * 9.80665 * 0.1)))
-    np.testing.assert_allclose(by_sensor(said)["depth"], [[10.0]], atol=1e-4)
+    decoded(autopilot(heard), *told)
+    assert heard.kinds == {"not stated: surface_hpa": 1, "not stated: density_kgm3": 1}
+    heard.kinds.clear()
+    decoded(autopilot(heard, Config().changed(depth={"surface_hpa": 990, "density_kgm3": 1025})), *told)
+    assert not heard.kinds
 
 
-def test_a_pressure_that_no_air_has_is_no_surface(heard):
-    said = decoded(autopilot(heard), packed(pressure2(hpa=1818.0)))
-    np.testing.assert_allclose(by_sensor(said)["depth"], [[100.0 * (1818.0 - 1013.25) / 9806.65]], atol=1e-4)
-    assert heard.kinds == {"surface": 1}
-
-
-def test_a_resumed_run_goes_on_with_the_surface_of_before(heard, tmp_path):
-    known = KnownSources(tmp_path, False, Warnings())
-    decoded(MavlinkDecoder("m", heard, Config(), MavlinkOptions(), known), packed(pressure2(hpa=1000.0)))
-    again = KnownSources(tmp_path, True, Warnings())
-    under_water = packed(pressure2(hpa=1000.0 + 98.0665))
-    said = decoded(MavlinkDecoder("m", heard, Config(), MavlinkOptions(), again), under_water)
-    np.testing.assert_allclose(by_sensor(said)["depth"], [[1.0]], atol=1e-4)
-    assert heard.kinds == {"surface": 1}
-    (tmp_path / "sources.json").write_text("{", encoding="utf-8")
-    assert KnownSources(tmp_path, True, Warnings()) == {}
+def test_options_of_surface_and_density_become_keys_of_the_configuration():
+    urls = ["mavlink:tcp:host:1?surface=900&density=1010", "mavlink:tcp:host:2", "file:log.csv?density=1000"]
+    with pytest.warns(rg.DataWarning, match=r"option (surface|density) will go; state depth: ") as said:
+        depth = with_depth_options(urls, Config()).depth
+    assert len(said) == 2 and (depth.surface_hpa, depth.density_kgm3) == (900.0, 1010.0)
+    with pytest.raises(InputError, match="option density: '-1', expected a number above 0"):
+        with_depth_options(["mavlink:tcp:host:1?density=-1"], Config())
 
 
 def test_an_imu_that_is_sent_twice_a_second_is_said_to_be_too_slow(heard):
@@ -740,7 +729,7 @@ def test_a_vehicle_is_heard_over_udp():
     sender.mav.scaled_pressure2_send(1000, 1013.25, 0.0, 1000)
     messages = take(source, 2)
     sender.close()
-    assert set(by_sensor(messages)) == {"ahrs", "depth"}
+    assert set(by_sensor(messages)) == {"ahrs", "pressure"}
 
 
 @pytest.fixture(scope="module")
@@ -752,11 +741,11 @@ def real_tlog() -> Path:
 
 def test_a_real_telemetry_log_is_read_whole(real_tlog):
     warnings = Warnings()
-    source = open_source(f"mavlink:{real_tlog}?surface=1013.25", warnings, speed="max")
+    source = open_source(f"mavlink:{real_tlog}", warnings, speed="max")
     messages = list(source.messages(threading.Event()))
     found = {sensor: np.array(values) for sensor, values in by_sensor(messages).items()}
     # as counted with pymavlink's own reader; the second IMU says zeros, fixes repeat
-    assert (len(found["ahrs"]), len(found["imu"]), len(found["mag"]), len(found["depth"])) == (5245, 528, 528, 635)
+    assert (len(found["ahrs"]), len(found["imu"]), len(found["mag"]), len(found["pressure"])) == (5245, 528, 528, 635)
     assert np.linalg.norm(np.median(found["imu"][:, :3], axis=0)) == pytest.approx(9.81, abs=0.2)
     assert 25.0 < np.median(np.linalg.norm(found["mag"], axis=1)) < 65.0  # the Earth's field [uT]
     assert np.ptp(found[GEODETIC][:, 0]) < 0.01
@@ -765,8 +754,8 @@ def test_a_real_telemetry_log_is_read_whole(real_tlog):
     stamps = np.array([m.stamp for m in messages])
     assert {m.clock for m in messages} == {"boot"}
     np.testing.assert_allclose(arrivals - stamps, np.median(arrivals - stamps), atol=2.0)
-    slow = {(source.url, "slow"): 1}  # its RAW_IMU came twice a second
-    assert warnings.counts == {(source.url, "bad data"): 4} | slow
+    once = "slow", "not stated: surface_hpa", "not stated: density_kgm3"  # its RAW_IMU came twice a second
+    assert warnings.counts == {(source.url, "bad data"): 4} | {(source.url, kind): 1 for kind in once}
 
 
 # NMEA

@@ -18,6 +18,7 @@ from recordings import close, first, read
 
 from rovgraph.errors import InputError
 from rovgraph.log import Log
+from rovgraph.model.config import Config
 from rovgraph.readers.formats import read_recording, recognise
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "ardusub"
@@ -80,7 +81,10 @@ def test_a_simulated_dive_comes_back_within_the_messages_resolution(form, tmp_pa
     recording = read(written(dive(), form), tmp_path)
     assert recording.format == ("tlog" if form == "tlog" else "blueos")
     before = Log.from_frame(short_dive(DECLINATION_DEG))
-    after = Log.from_arrays(*(first(recording, sensor).columns for sensor in RESOLUTION))
+    after = Log.from_arrays(
+        *(first(recording, sensor).columns for sensor in RESOLUTION),
+        config=Config().changed(depth=recording.settings["depth"]),
+    )
     for sensor, resolution in RESOLUTION.items():
         was, now = before[sensor], after[sensor]
         assert len(was) == len(now) > 10
@@ -181,19 +185,15 @@ def pressures(hpa: Iterable[float], parameters: dict[str, float]) -> list[Sent]:
     return sent
 
 
-def test_an_impossible_surface_pressure_becomes_no_depth_of_zero(tmp_path):
+def test_pressure_comes_with_what_the_autopilot_states_of_the_water_but_no_surface_that_no_air_has(tmp_path):
     hpa = 1010.0 + 98.0665 * np.minimum(np.arange(60) / 6.0, 5.0)
-    for stated in (1818e2, 0.0):
-        known = {"BARO_PRIMARY": 1, "BARO2_GND_PRESS": stated, "BARO_SPEC_GRAV": 1.0}
+    for stated in (1818e2, 0.0, 1010e2):
+        known = {"BARO_PRIMARY": 1, "BARO1_GND_PRESS": 990e2, "BARO2_GND_PRESS": stated, "BARO_SPEC_GRAV": 1.0}
         recording = read(written(in_time(attitudes(), pressures(hpa, known))), tmp_path)
-        assert first(recording, "depth").columns["depth"][-1] == pytest.approx(5.0, abs=0.2)
-        assert any(f"{stated / 100:.0f} hPa" in warning for warning in recording.warnings)
-
-
-def test_a_file_that_never_saw_the_surface_takes_the_standard_atmosphere_and_says_so(tmp_path):
-    recording = read(written(in_time(attitudes(), pressures([1818.0] * 20, {}))), tmp_path)
-    assert first(recording, "depth").columns["depth"][0] == pytest.approx(8.2, abs=0.1)
-    assert any("standard atmosphere" in warning for warning in recording.warnings)
+        np.testing.assert_allclose(first(recording, "depth").columns["pressure"], 100.0 * hpa, rtol=1e-6)
+        surface = {"surface_hpa": 1010.0} if stated == 1010e2 else {}
+        assert recording.settings["depth"] == {"density_kgm3": 1000.0, **surface}
+        assert any(f"{stated / 100:.0f} hPa" in warning for warning in recording.warnings) == (not surface)
 
 
 def fixes(points: Iterable[tuple[float, float]], fix_type: int = 3, step: int = 1) -> list[Sent]:

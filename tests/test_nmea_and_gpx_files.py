@@ -62,8 +62,7 @@ def test_headings_lie_evenly_between_sentences_with_a_time(tmp_path):
 
 def test_a_true_heading_says_so(tmp_path):
     recording = read(b"".join([gga("120000.00", 0.1), sentence("HEHDT,90.0,T"), gga("120001.00", 0.2)]), tmp_path)
-    assert recording.settings == {"environment": {"declination_deg": 0.0}}
-    assert any("relative to true north" in warning for warning in recording.warnings)
+    assert recording.settings == {"heading": {"ahrs_reference": "true"}}
 
 
 def test_heading_pitch_and_roll_of_one_sentence(tmp_path):

@@ -11,7 +11,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -29,7 +31,7 @@ from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
 from rovgraph.live.warnings import Warnings
-from rovgraph.log import read_log
+from rovgraph.log import Measurement, read_log
 from rovgraph.simulate.files import write_dive
 
 ONLINE = [sys.executable, "-c", "from rovgraph.cli.app import main; main()", "online"]
@@ -399,3 +401,28 @@ def test_a_summary_that_cannot_be_written_is_one_line_and_leaves_no_rest(capsys,
     line = refused(capsys, "online", f"file:{dive / 'log.csv'}", "--speed", "max", "--out", tmp_path / "out")
     assert "summary.json: cannot be written (No space left on device)" in line
     assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("replayed_s", [0.0, 1e3])
+def test_the_surface_is_kept_over_a_resumption_under_water(case, tmp_path, monkeypatch, replayed_s):
+    """From the checkpoint, and from a short recording that is read again."""
+    monkeypatch.setattr("rovgraph.live.files.REPLAYED_S", replayed_s)
+    monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
+    air, begin = 99_000.0, case.log.start
+
+    def dived(m: Measurement) -> Measurement:
+        if m.sensor != "depth":
+            return m
+        pascal = air + 1025.0 * 9.81 * np.clip(0.2 * (m.time - begin - 10.0), 0.0, 2.0)
+        return m._replace(sensor="pressure", values=np.array([pascal]))
+
+    log = [dived(m) for m in case.log.measurements()]
+    recorded(tmp_path, replace(case, log=SimpleNamespace(measurements=lambda: log)), begin + 30.0)
+    nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
+    files = Files(tmp_path, case.config, Warnings(), resume=True)
+    session = Session(nav, [], Warnings(), 2.0, files)
+    session.resume()
+    session.run(message(m) for m in log if begin + 30.0 <= m.time < begin + 35.0)
+    files.close()
+    assert files.replayed == (replayed_s > 0.0)
+    assert nav._intake.pressure.surface.value == pytest.approx(air)

@@ -1,9 +1,12 @@
 """Depth by pressure: the surface, the water, units, and what is told apart by its numbers."""
 
 from collections import Counter
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 import rovgraph as rg
 from rovgraph.geometry import Array
@@ -12,7 +15,11 @@ from rovgraph.live.intake import Intake
 from rovgraph.live.message import Reading
 from rovgraph.log import Log
 from rovgraph.model.config import Config
-from rovgraph.sensors.pressure import SurfacePressure, density, depths
+from rovgraph.sensors import SENSORS
+from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.pressure import OceanProfile, SurfacePressure, density, depths, waves_at_surface
+from rovgraph.sensors.sound import sound_speed
+from rovgraph.simulate import Path, Truth, simulate
 
 AIR = 100_300.0
 TIME = np.arange(0.0, 600.0, 0.5)
@@ -146,3 +153,97 @@ def test_the_density_is_stated_or_by_salinity_or_of_the_sea() -> None:
     assert density(Config().changed(sound={"salinity_psu": 0})) == pytest.approx(999.7)
     assert density(Config().changed(sound={"salinity_psu": 35})) == pytest.approx(1026.95, abs=0.1)
     assert density(Config().changed(sound={"salinity_psu": 35}, depth={"density_kgm3": 1010})) == 1010.0
+
+
+def test_waves_are_what_depths_scatter_at_the_surface() -> None:
+    rng = np.random.default_rng(3)
+    depth, _ = dive(begin=200.0, end=400.0)
+    waves = 0.3 * np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME / 5.3) * np.exp(-depth / 5.0)
+    noise = rng.normal(0.0, 0.02, len(TIME))
+    assert waves_at_surface(TIME, depth + waves + noise) == pytest.approx(0.3, rel=0.1)
+    assert waves_at_surface(TIME, depth + noise) == pytest.approx(0.02, rel=0.2)
+    assert waves_at_surface(TIME, depth + 5.0 + waves) == 0.0  # never there
+
+
+def test_waves_add_noise_near_the_surface_alone() -> None:
+    config = Config().changed(depth={"sd_m": 0.04, "waves_m": 0.3})
+    believed = instruments(config, np.zeros(3))["depth"]
+    sd = [float(SENSORS["depth"].standard_deviation(np.array([z]), believed, config)[0]) for z in (-0.1, 5.0, 40.0)]
+    np.testing.assert_allclose(sd, [np.hypot(0.04, 0.3), np.hypot(0.04, 0.3 / np.e), 0.04], rtol=1e-3)
+
+
+def test_depths_of_the_standard_ocean_are_those_that_gsw_publishes() -> None:
+    gsw = pytest.importorskip("gsw")
+    dbar = np.array([10.0, 50.0, 125.0, 250.0, 600.0, 1000.0])
+    published = [9.944583, 49.718090, 124.272622, 248.470058, 595.825348, 992.091906]  # check values of z_from_p
+    in_situ = gsw.t_from_CT(35.16504, 0.0, np.arange(0.0, 1300.0, 1.0))
+    depth = -gsw.z_from_p(np.arange(0.0, 1300.0, 1.0), 4.0)
+    standard = OceanProfile(depth, in_situ, np.full(len(depth), 35.0), 4.0)
+    np.testing.assert_allclose(standard.depth(1e4 * dbar), published, atol=1e-4)  # temperatures are linear between
+    assert float(gsw.sound_speed(34.7118, 28.7856, 10.0)) == pytest.approx(1542.426412, abs=1e-6)
+    assert float(gsw.p_from_z(-1000.0, 45.0)) == pytest.approx(1010.6370, abs=5e-5)
+
+
+def test_a_profile_of_the_water_gives_depths_by_teos_10(tmp_path: FilePath) -> None:
+    gsw = pytest.importorskip("gsw")
+    profile = tmp_path / "ctd.csv"
+    profile.write_text("depth,temperature,salinity\n0,15,30\n20,8,34\n500,4,35\n")
+    config = NORTH.changed(sound={"profile": str(profile)})
+    pressure = AIR + np.concatenate([np.zeros(60), np.linspace(0.0, 4e6, len(TIME) - 60)])
+    log = log_of(pressure, config)
+    assert log.notes[0].endswith("water of sound.profile, by TEOS-10")
+    # independently: hydrostatics with the density of each half metre
+    z = np.arange(0.0, 420.0, 0.5)
+    salt = 35.16504 / 35.0 * np.interp(z, [0.0, 20.0, 500.0], [30.0, 34.0, 35.0])
+    dbar = gsw.p_from_z(-z, 60.0)
+    rho = gsw.rho_t_exact(salt, np.interp(z, [0.0, 20.0, 500.0], [15.0, 8.0, 4.0]), dbar)
+    weight = np.concatenate([[0.0], np.cumsum(0.25 * (rho[1:] + rho[:-1]) * gsw.grav(60.0, dbar)[1:])])
+    np.testing.assert_allclose(log["depth"]["depth"], np.interp(pressure - AIR, weight, z), atol=0.01)
+    stated = log_of(pressure, config.changed(depth={"density_kgm3": 1025}))
+    assert "water of 1025" in stated.notes[0] and abs(stated["depth"]["depth"][-1] - log["depth"]["depth"][-1]) > 0.5
+
+
+def test_the_speed_of_sound_agrees_with_teos_10() -> None:
+    gsw = pytest.importorskip("gsw")
+    for salinity, temperature, depth in ((35.0, 10.0, 0.0), (35.0, 4.0, 1000.0), (5.0, 15.0, 50.0)):
+        p = gsw.p_from_z(-depth, 45.0)
+        absolute = 35.16504 / 35.0 * salinity
+        speed = gsw.sound_speed(absolute, gsw.CT_from_t(absolute, temperature, p), p)
+        assert float(sound_speed(salinity, temperature, depth)) == pytest.approx(float(speed), abs=0.5)
+
+
+def test_a_unit_of_the_header_is_judged_as_a_stated_one() -> None:
+    _, pressure = dive()
+    with pytest.warns(rg.DataWarning, match=r"the unit is psi: state units: \{pressure: psi\}"):
+        Log.from_arrays({"time": TIME, "pressure [bar]": pressure / 6894.757})
+
+
+@pytest.mark.slow
+def test_the_depth_follows_the_surface_through_a_tide() -> None:
+    """Three hours with 1 m of tide and stays at the surface at begin, middle and end, where the air has changed."""
+    t = np.arange(0.0, 10_801.0, 10.0)
+    legs = np.where((t // 150.0).astype(int) % 2 == 0, 0.3, 0.3 + np.pi)
+    yaw = gaussian_filter1d(legs, 1.0, mode="nearest")
+    place = np.cumsum(4.0 * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
+    under = np.ones(len(t))
+    for begin, end in ((-600.0, 120.0), (5340.0, 5460.0), (10_680.0, 11_400.0)):
+        under *= np.clip(np.maximum(begin - t, t - end) / 120.0, 0.0, 1.0)
+    below = gaussian_filter1d(under * (15.0 + 3.0 * np.sin(2.0 * np.pi * t / 900.0)), 2.0, mode="nearest")
+    path = Path.through(t, np.column_stack([place, below - tide(t)]), np.column_stack([0 * t, 0 * t, yaw]), rest=False)
+    config = NORTH.changed(heading={"sources": ["ahrs"]}, calibration={"ahrs_offset": {"estimate": False}})
+    right = {"depth_offset": np.zeros(1), "depth_scale": np.zeros(1)}
+    truth = Truth(config, calibration=right, imu_rate=10.0, dvl_rate=1.0, depth_rate=1.0, ahrs_rate=5.0)
+    dived = simulate(path, truth, np.random.default_rng(1))
+    frame = dived.log_frame.copy()
+    gravity = normal_gravity(np.deg2rad(60.0))
+    frame["pressure"] = AIR + 0.05 * frame["time"] + 1025.0 * gravity * (frame.pop("depth") + tide(frame["time"]))
+    track = rg.smooth(Log.from_frame(frame, config), config, "smoothed").smoothed.trajectory
+    truly = np.interp(track.time, dived.truth.time, dived.truth.p_n[:, 2]) + tide(track.time)
+    error = track.p_n[:, 2] - truly
+    assert float(np.sqrt(np.mean(error**2))) < 0.1
+    assert np.mean((error / track.p_sd[:, 2]) ** 2) < 1.5
+
+
+def tide(time: Any) -> Any:
+    """1 m in three hours [m]."""
+    return 0.5 - 0.5 * np.cos(2.0 * np.pi * time / 21_600.0)

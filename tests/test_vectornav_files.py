@@ -150,8 +150,8 @@ def test_sentences_lie_between_those_with_a_time(week, unix, tmp_path):
     recording = read(data, tmp_path)
     close(np.diff(first(recording, "imu").columns["time"]), 0.1, atol=1e-6)
     assert [clock.unix_offset for clock in recording.clocks.values()] == [unix]
-    assert recording.settings["environment"] == {"declination_deg": 0.0}  # VNINS is relative to true north
-    assert any("declination_deg is set to 0" in text for text in recording.warnings)
+    assert recording.settings["heading"] == {"ahrs_reference": "true"}  # VNINS is relative to true north
+    assert any("relative to true north" in text for text in recording.warnings)
 
 
 def test_the_rate_that_the_instrument_states_stamps_sentences_broken_ones_included(tmp_path):

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from rovgraph.api.logs import config_of, warn_of_unused
 from rovgraph.errors import InputError, as_path, as_texts
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.files import SETTINGS, Files, KnownSources
+from rovgraph.live.files import SETTINGS, Files
 from rovgraph.live.marks import Command, Marks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs import Output, open_output
 from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ, Feed, Session
 from rovgraph.live.solution import Solution
-from rovgraph.live.sources import open_sources
+from rovgraph.live.sources import open_sources, with_depth_options
 from rovgraph.live.sources.replay import LogReplay
 from rovgraph.live.warnings import Complain, Warnings
 from rovgraph.log import Log
@@ -303,8 +303,9 @@ class Online:
                 *(url.removeprefix("file:").partition("?")[0] for url in map(str, sources) if url.startswith("file:"))
             )
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
+        config = with_depth_options([url for url in sources if isinstance(url, str)], config)
         warnings = Warnings(on_warning)
-        opened = open_sources(sources, warnings, config, speed, KnownSources(folder, resume, warnings))
+        opened = open_sources(sources, warnings, config, speed)
         if resume and any(source.pace == 1.0 for source in opened):
             raise InputError("--resume cannot continue a replay at speed 1; add --speed max")
         feed = Feed(opened, warnings)

@@ -13,7 +13,7 @@ it then begins.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,7 @@ from rovgraph.log.reading import length_of_way, water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.model.config import GOOD_GYRO_DPS, Config, beliefs, mount_matrix, with_priors_stated
 from rovgraph.model.config_sections import HIGHEST_LATITUDE_DEG, Environment
+from rovgraph.model.grids import convergence_and_scale
 from rovgraph.model.origin import Frame, frame_of
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
@@ -56,10 +57,19 @@ from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
 from rovgraph.problem.layers import layer_sensors, with_knots
 from rovgraph.problem.motion import NO_BIAS_SD, SCALES, has_constant_velocity, motion_model, scatter, ticks
 from rovgraph.sensors import SENSORS, innovation
+from rovgraph.sensors.compass import reference
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.dvl_sound import SoundCorrection
-from rovgraph.sensors.earth_field import BLACKOUT_NT, EarthField, decimal_year, earth_field
+from rovgraph.sensors.earth_field import (
+    BLACKOUT_NT,
+    CAUTION_NT,
+    EarthField,
+    decimal_year,
+    declination_per_km,
+    earth_field,
+)
 from rovgraph.sensors.instruments import OFFSETS, Instrument, heading_sources, instruments
+from rovgraph.sensors.pressure import waves_at_surface
 
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
 
@@ -499,8 +509,10 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
         said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
         assumptions.append(f"profiles of the water are used; the current: {said}")
     assumptions += [why_not] if why_not else []
+    config = _resolve_norths(log, config, assumptions)
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
+    config = _resolve_waves(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams, *layers}
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = _resolve_sound(log, config, assumptions)
@@ -587,20 +599,11 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             changes["field_norm"] = float(np.median(norm))
             assumptions.append(f"environment.field_norm {changes['field_norm']:.4g}, the median of the log")
         if env.dip_deg is None:
-            imu = log["imu"]
-            f = np.column_stack([np.interp(log["mag"].time, imu.time, a) for a in imu.data[:, :3].T])
-            sine = -np.sum(f * mag, axis=1) / (np.linalg.norm(f, axis=1) * norm)
-            changes["dip_deg"] = float(np.rad2deg(np.arcsin(np.clip(np.nanmedian(sine), -1.0, 1.0))))
+            changes["dip_deg"] = dip_of_log(log)
             assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log")
             if not beliefs(config)["field_dip"].estimate:
                 hint = "give it, or estimate calibration.field_dip"
                 assumptions[-1] += f", and held, with the error of the levelling in it: {hint}"
-    if (field := field_by_place(log, config)) is not None and field.horizontal_nt > BLACKOUT_NT:
-        changes["declination_deg"] = round(field.declination_deg, 2)
-        assumptions.append(
-            f"environment.declination_deg {field.declination_deg:.2f} within {field.declination_sd_deg:.1f} deg, by "
-            f"WMM2025 at the origin and the date of the log{', which the model does not reach' * field.expired}"
-        )
     frame = _frame(log, config)
     if log.origin is not None and (env.latitude_deg is None or frame == "earth"):
         changes["latitude_deg"] = log.origin[0]
@@ -616,15 +619,103 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
     return config.model_copy(update={"environment": env})
 
 
-def field_by_place(log: Log, config: Config) -> EarthField | None:
-    """The Earth's field where a dive begins, if its only compass is a magnetometer and no declination is stated.
+def dip_of_log(log: Log) -> float:
+    """Dip of the field by the magnetometer against gravity [deg], the median of the log."""
+    imu, mag = log["imu"], log["mag"]
+    f = np.column_stack([np.interp(mag.time, imu.time, a) for a in imu.data[:, :3].T])
+    sine = -np.sum(f * mag.data, axis=1) / (np.linalg.norm(f, axis=1) * np.linalg.norm(mag.data, axis=1))
+    return float(np.rad2deg(np.arcsin(np.clip(np.nanmedian(sine), -1.0, 1.0))))
 
-    None where it is stated, the log knows no place or date, or another compass may be relative to true north.
-    """
-    stated = "declination_deg" in config.environment.model_fields_set
-    if stated or log.origin is None or heading_sources(config, log.sensors) != ["mag"] or not is_unix(log.start):
+
+def field_by_place(log: Log) -> EarthField | None:
+    """The Earth's field where a dive begins; None where the log knows no place or date."""
+    if log.origin is None or not is_unix(log.start):
         return None
     return earth_field(*log.origin, 0.0, decimal_year(log.start))
+
+
+def slope_by_place(log: Log) -> tuple[float, float]:
+    """Change of the declination by a kilometre north and east where a dive begins [deg/km]; 0 where it is not known."""
+    if log.origin is None:
+        return 0.0, 0.0
+    north, east = declination_per_km(*log.origin, decimal_year(log.start))
+    return round(north, 5), round(east, 5)
+
+
+def declination_by_place(log: Log, config: Config) -> EarthField | None:
+    """The field that the declination is taken from: where none is stated, and no compass may have taken it already."""
+    norths = [reference(config, source) for source in heading_sources(config, log.sensors)]
+    if "declination_deg" in config.environment.model_fields_set or None in norths or "magnetic" not in norths:
+        return None
+    return field_by_place(log)
+
+
+def _resolve_norths(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """The norths of the compasses in use: declination, dip and blackout by place and date, convergence by the grid.
+
+    Raises
+    ------
+    InputError : a heading relative to a grid that is not known
+    """
+    sources = heading_sources(config, log.sensors)
+    config = with_convergence(log, config, assumptions)
+    magnetic = [source for source in sources if reference(config, source) in ("magnetic", None)]
+    field = field_by_place(log) if magnetic else None
+    if field is None:
+        return config
+    weak = f"the horizontal field is {field.horizontal_nt:.0f} nT by WMM2025"
+    if field.horizontal_nt < BLACKOUT_NT and config.heading.sources is None:
+        kept = tuple(SENSORS[source].heading_source for source in sources if source not in magnetic)
+        assumptions.insert(0, f"no heading from {', '.join(magnetic)}: {weak}; name it under heading.sources to use it")
+        return config.model_copy(update={"heading": config.heading.model_copy(update={"sources": kept})})
+    if field.horizontal_nt < CAUTION_NT:
+        assumptions.append(f"compasses show little here: {weak}, and storms turn them by many degrees")
+    changes: dict[str, Any] = {}
+    expired = ", which ends before that date: use a newer rovgraph, or state it" if field.expired else ""
+    if (taken := declination_by_place(log, config)) is not None and field.horizontal_nt >= BLACKOUT_NT:
+        changes["declination_deg"] = round(taken.declination_deg, 2)
+        slope = config.environment.declination_per_km_deg or slope_by_place(log)
+        changes["declination_per_km_deg"] = slope
+        config = _with_declination_sd(config, magnetic, taken.declination_sd_deg)
+        assumptions.append(
+            f"environment.declination_deg {taken.declination_deg:.2f} within {taken.declination_sd_deg:.1f} deg, by "
+            f"WMM2025 at the origin and the date of the log, by km north and east "
+            f"{slope[0]:+.4f} and {slope[1]:+.4f} deg{expired}"
+        )
+    if "mag" in sources and config.environment.dip_deg is None:
+        changes["dip_deg"] = round(field.dip_deg, 2)
+        assumptions.append(f"environment.dip_deg {field.dip_deg:.1f}, by WMM2025{expired}")
+    return config.model_copy(update={"environment": config.environment.model_copy(update=changes)})
+
+
+def _with_declination_sd(config: Config, sources: Sequence[str], sd_deg: float) -> Config:
+    """Offsets of compasses that are known better than the declination are known as well as that."""
+    entries = {}
+    for name in (OFFSETS[source] for source in sources):
+        entry = getattr(config.calibration, name)
+        own = 0.0 if entry.estimate is False else entry.sd_deg
+        if own is not None:  # the sd of one that is not stated is far larger
+            entries[name] = entry.model_copy(update={"estimate": True, "sd_deg": float(np.hypot(own, sd_deg))})
+    return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
+
+
+def with_convergence(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Where grid north points, where a compass in use is relative to it and it is not stated.
+
+    Raises
+    ------
+    InputError : the grid or the place is not known
+    """
+    of_grid = [source for source in heading_sources(config, log.sensors) if reference(config, source) == "grid"]
+    env = config.environment
+    if not of_grid or env.convergence_deg is not None:
+        return config
+    if env.grid is None or log.origin is None:
+        lacking = "environment.grid, such as EPSG:32632" if env.grid is None else "the origin or fixes on Earth"
+        raise InputError(f"{of_grid[0]} is relative to a grid's north, which needs {lacking}, or convergence_deg")
+    found = float(convergence_and_scale(env.grid, *np.array(log.origin))[0])
+    assumptions.append(f"environment.convergence_deg {found:.3f}, of {env.grid} at the origin")
+    return config.model_copy(update={"environment": env.model_copy(update={"convergence_deg": found})})
 
 
 def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str]) -> float:
@@ -720,6 +811,18 @@ def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
         return config
     imu_section = config.imu.model_copy(update={"noise": noise.model_copy(update=changes)})
     return config.model_copy(update={"imu": imu_section})
+
+
+def _resolve_waves(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """State the waves' pressure at the surface, where depths scatter there far more than they should."""
+    if "depth" not in log or config.depth.waves_m is not None:
+        return config
+    seen, believed = waves_at_surface(log["depth"].time, log["depth"]["depth"]), config.depth.sd_m
+    waves = 0.0
+    if seen > NOISIER * believed:
+        waves = round(float(np.sqrt(seen**2 - believed**2)), 3)
+        assumptions.append(f"depth.waves_m {waves:g}, as depths scatter at the surface; less further down")
+    return config.model_copy(update={"depth": config.depth.model_copy(update={"waves_m": waves})})
 
 
 def _resolve_sound(log: Log, config: Config, assumptions: list[str]) -> Config:

@@ -177,15 +177,18 @@ def heading_of(R: Array, axis_b: Array, gradient_out: Array) -> float:
 
 
 @view_helper
-def compass(R: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out: Array, work: Array) -> None:
-    """Magnetic heading of an instrument's x axis, of the DVL's with the mounting that the calibration has."""
+def compass(R: Array, p: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out: Array, work: Array) -> None:
+    """Heading of an instrument's x axis, of the DVL's with the mounting that the calibration has.
+
+    The declination changes with the place, by so little for a metre that the heading does not show the place.
+    """
     R_bs, axes, axis, gradient = work[0], work[1], work[2, 0], work[2, 1]
     offset, curve, error = int(params[1]), int(params[2]), int(params[3])
     if in_dvl:
         dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], R_bs, axes)
     for i in range(3):
         axis[i] = R_bs[i, 0] if in_dvl else params[4 + i]
-    heading = heading_of(R, axis, gradient) - params[0]
+    heading = heading_of(R, axis, gradient) - (params[0] + params[7] * p[0] + params[8] * p[1])
     sine, cosine = math.sin(heading), math.cos(heading)
     deviation = c[offset] + c[curve] * sine + c[curve + 1] * cosine
     if error >= 0:
@@ -246,8 +249,9 @@ def _by_soft_iron(w: Array, H_out: Array) -> None:
 
 
 @view_helper
-def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, work: Array) -> None:
-    """Magnetic field in IMU axes, with deviation, soft iron and hard iron."""
+def magnetometer(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array, work: Array) -> None:
+    """Magnetic field in IMU axes, with deviation, soft iron and hard iron; its declination as that of `compass`."""
+    declination = params[0] + params[12] * p[0] + params[13] * p[1]
     turns_n, turns_b, S, A, M, seen = work[0], work[1], work[2], work[3], work[4], work[0]
     u_b, gradient, w = work[5, 0], work[5, 1], work[5, 2]
     magnitude, gain = params[2], 1.0 + c[FIELD_SCALE]
@@ -255,11 +259,11 @@ def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, 
         u_b[i] = params[3 + 3 * i]  # the x axis, for its heading
         for k in range(3):
             A[i, k] = magnitude * gain * params[3 + 3 * k + i]
-    heading = heading_of(R, u_b, gradient) - params[0]
+    heading = heading_of(R, u_b, gradient) - declination
     sine, cosine = math.sin(heading), math.cos(heading)
     B, C = c[MAG_DEVIATION], c[MAG_DEVIATION + 1]
     slope = B * cosine - C * sine
-    _field_turns(params[0] - (c[MAG_OFFSET] + B * sine + C * cosine), params[1] + c[FIELD_DIP], turns_n)
+    _field_turns(declination - (c[MAG_OFFSET] + B * sine + C * cosine), params[1] + c[FIELD_DIP], turns_n)
     multiply_transposed(R, turns_n, turns_b)
     _soft_iron(c[SOFT_IRON : SOFT_IRON + 6], S)
     multiply(S, A, M)
@@ -642,9 +646,9 @@ def predict(kind: int, state: Epoch, rate: Array, params: Array, z_out: Array, H
     if kind in (DVL, DVL_WATER):
         dvl_velocity(state, rate, params, kind == DVL_WATER, z_out, H_out, work)
     elif kind in (DVL_COMPASS, COMPASS):
-        compass(R, c, params, kind == DVL_COMPASS, z_out, H_out, work)
+        compass(R, p, c, params, kind == DVL_COMPASS, z_out, H_out, work)
     elif kind == MAGNETOMETER:
-        magnetometer(R, c, params, z_out, H_out, work)
+        magnetometer(R, p, c, params, z_out, H_out, work)
     elif kind == POSITION:
         position(R, p, c, params, z_out, H_out)
     elif kind == PLACE_OFFSET:

@@ -439,7 +439,6 @@ def _one_line(path: Path) -> Iterator[None]:
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
 CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
-KNOWN = "sources.json"
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
@@ -523,9 +522,8 @@ class Files:
             env = self.config.environment
             env = env.model_copy(update={"frame": self.config.frame_at(env.latitude or 0.0)})  # as `Intake` has it
             # recorded under rovgraph's own names, in SI
-            config = Config(environment=env, depth=self.config.depth, sound=self.config.sound)
-            return replace(read_log(path, config), config=None)
-        return Log.from_frame(_last_rows(path, origin_of(self.state)), source=str(path))
+            return replace(read_log(path, Config(environment=env), keep_pressure=True), config=None)
+        return Log.from_frame(_last_rows(path, origin_of(self.state)), source=str(path), keep_pressure=True)
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
@@ -583,39 +581,6 @@ class Files:
     def close(self) -> None:
         self.keeper.close()
         self.recorder.close()
-
-
-class KnownSources(dict[str, float]):
-    """Values that sources have found and a resumed run needs, such as the pressure at the surface, in a file.
-
-    Parameters
-    ----------
-    folder : of the run; None = it is not kept
-    resume : continue with what is there
-    warnings : receives that it cannot be written
-    """
-
-    def __init__(self, folder: Path | None, resume: bool, warnings: Warnings) -> None:
-        super().__init__()
-        self._path, self._warnings = None if folder is None else folder / KNOWN, warnings
-        if resume and self._path is not None and self._path.is_file():
-            try:
-                self.update({str(key): float(value) for key, value in json.loads(self._path.read_bytes()).items()})
-            except (OSError, ValueError, TypeError, AttributeError):
-                warnings.complain(str(self._path), "damaged", "is damaged: what sources had found out is found again")
-
-    def __setitem__(self, key: str, value: float) -> None:
-        if self.get(key) == value:
-            return
-        super().__setitem__(key, value)
-        if self._path is None:
-            return
-        partial = self._path.with_name(f".{KNOWN}.partial")
-        try:
-            partial.write_text(json.dumps(self), encoding="utf-8")
-            partial.replace(self._path)
-        except OSError as error:
-            self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
 
 
 def _last_rows(path: Path, origin: Origin | None) -> pd.DataFrame:

@@ -167,10 +167,6 @@ class Intake:
             return None
         return below
 
-    def choose_depth_again(self) -> None:
-        """Forget which column depths came from, as a recording that is read again has one for both."""
-        self._depths_by = ""
-
     def _is_unplaced(self, sensor: str, values: Array) -> bool:
         """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
         named = self._names(sensor, values)

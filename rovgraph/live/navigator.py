@@ -175,7 +175,6 @@ class Navigator:
                 accepted = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
                 if accepted is not None:
                     self._consider(accepted, by_hand=accepted.sensor == "fix")  # some may be
-        self._intake.choose_depth_again()
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
 

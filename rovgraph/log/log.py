@@ -45,7 +45,9 @@ class Log:
     notes: tuple[str, ...] = ()
 
     @staticmethod
-    def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
+    def from_frame(
+        frame: pd.DataFrame, config: Config | None = None, source: str = "log", keep_pressure: bool = False
+    ) -> "Log":
         """Make a log from a data frame, as `read_log` would from a file.
 
         Parameters
@@ -53,6 +55,7 @@ class Log:
         frame : columns of a log (docs/log-format.md), one row per event; the index is ignored
         config : for the frame's columns, units, delays and magnetometer's calibration
         source : name for messages
+        keep_pressure : a stream "pressure" stays, beside "depth"; else it becomes "depth"
 
         Raises
         ------
@@ -62,7 +65,7 @@ class Log:
         -----
         DataWarning : what was ignored or sorted
         """
-        return _log([table_of_frame(frame, source)], config, source)
+        return _log([table_of_frame(frame, source)], config, source, keep_pressure=keep_pressure)
 
     @staticmethod
     def from_arrays(
@@ -215,7 +218,7 @@ class Log:
         if self.config is None:
             return
         tables = "columns", "units", "angles", "times", "files", "delay_s", "imu.mag"
-        place = "environment.origin", "environment.frame"
+        place = "environment.origin", "environment.frame", "environment.grid"
         for key in (*tables, *place, "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
@@ -237,7 +240,7 @@ class Log:
             yield Measurement(t, names[k], data[k][i], rows[k][i])
 
 
-def read_log(path: Path | str, config: Config | None = None) -> Log:
+def read_log(path: Path | str, config: Config | None = None, keep_pressure: bool = False) -> Log:
     """Read a log, and what lies beside it: each beam of its DVL in ``log.dvl_beams.csv``, profiles in ``log.adcp.csv``.
 
     Parameters
@@ -245,6 +248,7 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     path : CSV, gzipped CSV or Parquet
     config : for the log's columns, units and delays, and the magnetometer's calibration: times are those of the
         measurements, and everything that takes the log sees the field
+    keep_pressure : of `Log.from_frame`
 
     Raises
     ------
@@ -258,15 +262,22 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
         table = read_table(path)
         beams = beams_beside(Path(path), config_or_defaults(config))
         cells = cells_beside(Path(path), config_or_defaults(config))
-    return _log([table], config, table.source, texts).with_beams(beams).with_profiles(cells)
+    log = _log([table], config, table.source, texts, keep_pressure)
+    return log.with_beams(beams).with_profiles(cells)
 
 
-def _log(tables: Iterable[Table], config: Config | None, source: str, before: Iterable[str] = ()) -> Log:
+def _log(
+    tables: Iterable[Table],
+    config: Config | None,
+    source: str,
+    before: Iterable[str] = (),
+    keep_pressure: bool = False,
+) -> Log:
     """A log of tables that share no stream, with what was warned of ``before`` and while its streams were made."""
     config = config_or_defaults(config)
     with collected_warnings() as texts:
         notes: list[str] = []
-        streams, origin = read_streams(tables, config, source, notes)
+        streams, origin = read_streams(tables, config, source, notes, keep_pressure)
     return Log(source, streams, origin, config, (*before, *texts), notes=tuple(notes))
 
 

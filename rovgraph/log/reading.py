@@ -17,6 +17,7 @@ from rovgraph.log.stamps import STEP_BACK, mend, require_moving
 from rovgraph.log.streams import (
     DATE,
     LAT_LON,
+    OF_GRID,
     RECEIVED,
     SHIP_LAT_LON,
     SPACING_S,
@@ -43,6 +44,7 @@ from rovgraph.log.units import (
     turn_angles,
 )
 from rovgraph.model.config import Config, TableSettings
+from rovgraph.model.grids import lat_lon_of_grid
 from rovgraph.model.origin import EarthOrigin, Origin, north_east, origin_in
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.sensors.dvl_beam import BEAMS
@@ -52,6 +54,7 @@ from rovgraph.sensors.water_layer import CELLS
 
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = {"flat": 100e3, "auto": 1000e3, "earth": np.inf}  # of fixes from an origin: that far it is a mistake [m]
+GRID_NORTHING, GRID_EASTING = 1e5, 5e4  # no dive is that far from its origin both ways [m]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
 
 Bools = NDArray[np.bool_]
@@ -59,7 +62,11 @@ Lines = NDArray[np.int64]
 
 
 def read_streams(
-    tables: Iterable[Table], config: Config, source: str, notes: list[str] | None = None
+    tables: Iterable[Table],
+    config: Config,
+    source: str,
+    notes: list[str] | None = None,
+    keep_pressure: bool = False,
 ) -> tuple[dict[str, Stream], Origin | None]:
     """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
@@ -68,6 +75,7 @@ def read_streams(
     tables : whose columns feed different streams
     source : their name, for messages
     notes : to be added to, how it was read
+    keep_pressure : they are not turned into depths
 
     Returns
     -------
@@ -93,7 +101,8 @@ def read_streams(
         found |= _streams(table, cells, line, origin)
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
-    _add_depth(found, config, origin, source, [] if notes is None else notes)
+    if not keep_pressure:
+        _add_depth(found, config, origin, source, [] if notes is None else notes, names)
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
@@ -103,8 +112,10 @@ def read_streams(
     return found | with_sound_speed(found, found, config), origin
 
 
-def _add_depth(found: dict[str, Stream], config: Config, origin: Origin | None, source: str, notes: list[str]) -> None:
-    """Turn pressures into depths, or leave them out beside depths.
+def _add_depth(
+    found: dict[str, Stream], config: Config, origin: Origin | None, source: str, notes: list[str], names: Iterable[str]
+) -> None:
+    """Turn pressures into depths, or leave them out beside depths; one of the names of columns may state their unit.
 
     Raises
     ------
@@ -120,7 +131,9 @@ def _add_depth(found: dict[str, Stream], config: Config, origin: Origin | None, 
         warn(f"{source}: depth is ignored beside pressure; depth.source: depth uses it instead")
     pascal = pressure["pressure"]
     if config.depth.surface_hpa is None:
-        factor = UNITS["pressure"].get(config.units.get("pressure", ""), 1.0)
+        written = next((name for name in names if name_and_bracket(name)[0] == PRESSURE.name), PRESSURE.name)
+        unit = config.units.get(PRESSURE.name) or _units_of_header({PRESSURE.name: written}).get(PRESSURE.name, "Pa")
+        factor = UNITS["pressure"][unit]
         for text in complaints(pascal, factor, UNITS["pressure"], source):
             warn(text)
     below, said = depths(pressure.time, pascal, config, None if origin is None else origin[0])
@@ -226,7 +239,52 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
     for name in scale.keys() & cells.keys():
         cells[name] = scale[name](cells[name])
     turn_angles(cells, settings.angles, table.source)
-    return {name: cells[name] for name in names}, names
+    cells = {name: cells[name] for name in names}
+    for lat_lon, of_grid in OF_GRID.items():
+        _on_ellipsoid(cells, names, lat_lon, of_grid, settings.grid, table.source)
+    return cells, names
+
+
+def _on_ellipsoid(
+    cells: dict[str, Array],
+    names: dict[str, str],
+    lat_lon: tuple[str, str],
+    of_grid: tuple[str, str],
+    grid: str | None,
+    source: str,
+) -> None:
+    """Put northing and easting of a map grid in place of latitude and longitude, in cells and names.
+
+    Raises
+    ------
+    InputError : the grid is not stated, or has no such places
+
+    Warns
+    -----
+    DataWarning : north and east are as large as a grid's; latitude and longitude stand beside a grid's places
+    """
+    local = [name.replace("ing", "") for name in of_grid]
+    if all(name in cells and np.isfinite(cells[name]).any() for name in local):
+        north, east = (float(np.nanmedian(np.abs(cells[name]))) for name in local)
+        if north > GRID_NORTHING and east > GRID_EASTING:
+            warn(
+                f"{source}: {local[0]} {north:.0f}, {local[1]} {east:.0f} are places of a map grid, whose north is "
+                f"not true north: name them {of_grid[0]} and {of_grid[1]}, and state environment.grid, as EPSG:32632"
+            )
+    if not {*of_grid} <= cells.keys():
+        return
+    if grid is None:
+        raise InputError(
+            f"{source}: {of_grid[0]} and {of_grid[1]} are of a map grid, which is not stated; state environment.grid, "
+            "such as EPSG:32632 for UTM zone 32 north"
+        )
+    northing, easting = (cells.pop(name) for name in of_grid)
+    written = [names.pop(name) for name in of_grid]
+    if {*lat_lon} & cells.keys():
+        warn(f"{source}: {of_grid[0]} and {of_grid[1]} are ignored beside {' and '.join(lat_lon)}")
+        return
+    for name, values, column in zip(lat_lon, lat_lon_of_grid(grid, easting, northing), written, strict=True):
+        cells[name], names[name] = values, column
 
 
 def _units_of_header(names: Mapping[str, str]) -> dict[str, str]:

@@ -33,6 +33,7 @@ class _Streams(Mapping[str, tuple[str, ...]]):
 STREAMS: Mapping[str, tuple[str, ...]] = _Streams()  # sensor -> its columns
 LAT_LON = ("fix_lat", "fix_lon")
 SHIP_LAT_LON = ("ship_lat", "ship_lon")
+OF_GRID = {LAT_LON: ("fix_northing", "fix_easting"), SHIP_LAT_LON: ("ship_northing", "ship_easting")}  # become these
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
 VERSION_COLUMN = "rovgraph_log"  # version of the log's form; without this column it is 1
 DATE = "date"  # day, or GPS week, of the times beside it
@@ -53,7 +54,8 @@ def labels() -> set[str]:
 
 def is_column(name: str) -> bool:
     """Whether a log may have a column of this name."""
-    others = name == "time" or name in (*LAT_LON, *SHIP_LAT_LON) or THRUSTER.fullmatch(name) is not None
+    places = (*LAT_LON, *SHIP_LAT_LON, *OF_GRID[LAT_LON], *OF_GRID[SHIP_LAT_LON])
+    others = name == "time" or name in places or THRUSTER.fullmatch(name) is not None
     return others or any(name in sensor.column_names for sensor in SENSORS.values())
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from rovgraph.dates import EPOCHS, unix_of_epoch
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, all_columns
+from rovgraph.log.streams import LAT_LON, OF_GRID, SHIP_LAT_LON, all_columns
 from rovgraph.sensors import SENSORS
 
 _DEG = float(np.deg2rad(1.0))
@@ -103,8 +103,8 @@ def groups() -> dict[str, tuple[str, ...]]:
             if column.quantity is not None:
                 group = column.group or sensor.name
                 out[group] = (*out.get(group, ()), column.name)
-    out["fix"] += LAT_LON
-    out["ship"] += SHIP_LAT_LON
+    out["fix"] += (*LAT_LON, *OF_GRID[LAT_LON])
+    out["ship"] += (*SHIP_LAT_LON, *OF_GRID[SHIP_LAT_LON])
     return out
 
 
@@ -112,7 +112,8 @@ def quantities() -> dict[str, str]:
     """Column -> what it measures, a key of `UNITS`."""
     measured = [c for sensor in SENSORS.values() for c in sensor.columns if c.quantity is not None]
     angles = dict.fromkeys((*LAT_LON, *SHIP_LAT_LON), "latitude")
-    return {"time": "time", **{c.name: str(c.quantity) for c in measured}, **angles}
+    of_grid = dict.fromkeys((*OF_GRID[LAT_LON], *OF_GRID[SHIP_LAT_LON]), "length")
+    return {"time": "time", **{c.name: str(c.quantity) for c in measured}, **angles, **of_grid}
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -308,7 +308,7 @@ class Config(ConfigSection):
     times: DateSettings = DateSettings()
     files: dict[str, FileSettings] = Field(
         default_factory=dict,
-        description="name or pattern of a file: its own columns, units, angles, times, delay_s",
+        description="name or pattern of a file: its own columns, units, angles, times, grid, delay_s",
     )
     delay_s: Delays = Field(
         {},
@@ -351,7 +351,9 @@ class Config(ConfigSection):
     @property
     def table(self) -> TableSettings:
         """How tables are written that `files` does not name."""
-        return TableSettings(columns=self.columns, units=self.units, angles=self.angles, times=self.times)
+        return TableSettings(
+            columns=self.columns, units=self.units, angles=self.angles, times=self.times, grid=self.environment.grid
+        )
 
     def of_file(self, path: Path) -> FileSettings:
         """How a file is written: by the pattern of `files` that it fits, then by what holds for all.

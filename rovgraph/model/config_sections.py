@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from rovgraph.dates import DateRules
@@ -96,8 +96,17 @@ class Environment(ConfigSection):
     )
     declination_deg: float = Field(
         0.0,
-        description="magnetic declination, east positive; not given = by place and date for a magnetometer that is the "
-        "only compass, else 0",
+        description="magnetic declination, east positive; not given = by place and date where all compasses in use are "
+        "magnetic, as a magnetometer is and others by heading.*_reference, else 0",
+    )
+    declination_per_km_deg: tuple[float, float] | None = Field(
+        None, description="its change by a kilometre north and east; null = as the declination, by place and date, or 0"
+    )
+    grid: str | None = Field(
+        None, description="map grid of fix_northing, fix_easting and of grid headings, such as EPSG:32632"
+    )
+    convergence_deg: Annotated[float, Field(gt=-180, lt=180)] | None = Field(
+        None, description="grid north from true north, east positive; null = of the grid at the origin"
     )
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
@@ -338,13 +347,22 @@ class Water(ConfigSection):
     )
 
 
+North = Annotated[  # YAML reads true as a truth value
+    Literal["magnetic", "true", "grid"], BeforeValidator(lambda given: "true" if given is True else given)
+]
+_NORTH = "north that {} is relative to: magnetic, true or grid; null = magnetic, by environment.declination_deg or 0"
+
+
 class Heading(ConfigSection):
-    """Heading sources and their noise."""
+    """Heading sources, the north that they are relative to, and their noise."""
 
     sources: tuple[HeadingSource, ...] | None = Field(
         None,
         description="any of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle in the log",
     )
+    ahrs_reference: North | None = Field(None, description=_NORTH.format("the IMU's own heading"))
+    dvl_reference: North | None = Field(None, description=_NORTH.format("the DVL's compass"))
+    vehicle_reference: North | None = Field(None, description=_NORTH.format("the vehicle's own heading"))
     mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
     dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
     ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
@@ -376,6 +394,9 @@ class Depth(ConfigSection):
         None, description="density of the water [kg/m3], for depth by pressure; null = by sound.salinity_psu, else 1025"
     )
     sd_m: Positive = Field(0.05, description="noise of a depth sample")
+    waves_m: NotNegative | None = Field(
+        None, description="sd of the waves' pressure at the surface, as depth; null = as depths scatter there"
+    )
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is rejected")
@@ -638,6 +659,7 @@ class TableSettings(ConfigSection):
     units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)
     angles: Angles = Field(default_factory=dict, description=ANGLES_TEXT)
     times: DateSettings = DateSettings()
+    grid: str | None = Field(None, description="map grid of fix_northing and fix_easting; null = environment.grid")
 
 
 AS_WRITTEN: dict[str, object] = {

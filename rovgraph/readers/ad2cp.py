@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.readers.ardupilot import FRESH, GRAVITY
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.nortek import (
     AD2CP_FAMILIES,
@@ -85,18 +84,19 @@ class AD2CP:
                 if table := beam_table(track):
                     tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = table
         channels += _attitude(content, found)
-        channels += _depth(content, found)
+        channels += _pressure(content, found)
         water, of_dvl = _sound(content, found)
         channels += water
         if np.isfinite(signature.beams).any():
             of_dvl["beams"] = {"angle_deg": BEAM_ANGLE_DEG, "azimuth_deg": AZIMUTHS_DEG}
         elif any("velocity_1" in table for table in tables.values()):
             notes.append("where the beams of a Nortek DVL point is not stated: rovgraph calibrate dvl-beams fits it")
-        settings = {"dvl": of_dvl} if of_dvl else {}
+        settings: dict[str, Any] = {"dvl": of_dvl} if of_dvl else {}
         if not channels:
             raise InputError(f"{path}: holds no bottom track (records 0x17, 0x1B); the instrument has to record it")
         if any(channel.sensor == "depth" for channel in channels):
-            notes.append(f"depth is pressure in fresh water ({FRESH:g} kg/m3) above the offset that the instrument has")
+            settings["depth"] = {"surface_hpa": 0.0}
+            notes.append("pressure is above the offset that the instrument has, the air's as it was set")
         return Recording(
             str(path), self.name, tuple(channels), {CLOCK: Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")},
             tuple(_left(found, refused)), settings, tuple(notes),
@@ -213,16 +213,16 @@ def _attitude(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
     yield Channel("vehicle_tilt", {"time": time, "roll": roll, "pitch": pitch}, f"{source}: roll, pitch", "", CLOCK)
 
 
-def _depth(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
+def _pressure(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
     for kind, fields, to_pascal in (
         (DVL_BOTTOM, DVL_FIELDS, BAR),
         (SIGNATURE, SIGNATURE_FIELDS, 1e-3 * 0.1 * BAR),
     ):
         records, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
         if there.any():
-            depth = to_pascal * records["pressure"].astype(float) / (FRESH * GRAVITY)
+            pascal = to_pascal * records["pressure"].astype(float)
             time = _time(records["date"], records["fraction"])
-            yield Channel("depth", {"time": time, "depth": depth}, f"bottom track {kind:#x}: pressure", "", CLOCK)
+            yield Channel("depth", {"time": time, "pressure": pascal}, f"bottom track {kind:#x}: pressure", "", CLOCK)
 
 
 def _sound(content: bytes | mmap.mmap, found: Records) -> tuple[list[Channel], dict[str, Any]]:

@@ -1,7 +1,6 @@
-"""ArduPilot's parameters, depth from pressure, and valid satellite fixes, for its own logs and for MAVLink.
+"""ArduPilot's parameters and valid satellite fixes, for its own logs and for MAVLink.
 
-`surface_pressure` finds which pressure is that of the surface. Parameters:
-https://ardupilot.org/sub/docs/parameters.html.
+Parameters: https://ardupilot.org/sub/docs/parameters.html.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,48 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.readers.recording import Zero
+from rovgraph.sensors.pressure import LEAST, MOST
 
-STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
-GRAVITY = 9.80665  # [m/s2]
-FRESH = 1000.0  # density of water [kg/m3]
-PLAUSIBLE = 50_000.0, 110_000.0  # of air where people dive, mountain lakes included [Pa]
-
-
-def surface_pressure(stated: float | None, pressure: Array) -> tuple[float, str, bool]:
-    """The pressure at depth 0.
-
-    Parameters
-    ----------
-    stated : the file's own value [Pa], None = without one
-    pressure : ndarray, shape (n,), all that were measured [Pa]
-
-    Returns
-    -------
-    pressure [Pa], where it comes from, whether that is as good as what a file states
-    """
-    low, high = PLAUSIBLE
-    if stated is not None and low <= stated <= high:
-        return stated, "as the file states", True
-    said = "not stated" if stated is None else f"stated as {stated / 100.0:.0f} hPa, which no air has"
-    sane = pressure[np.isfinite(pressure) & (pressure >= low)]
-    least = float(np.quantile(sane, 0.01)) if len(sane) else np.inf  # of outliers none
-    if least <= high:
-        return least, f"{said}; the least that was measured", False
-    return STANDARD, f"{said}, and never measured; the standard atmosphere", False
-
-
-def zero_of(surface: float, density: float, said: str) -> Zero:
-    """The surface as a depth, where it is guessed by the measured pressures."""
-    return Zero(surface / (density * GRAVITY), said, surface != STANDARD)
-
-
-def depth(pressure: Array, surface: float, density: float) -> Array:
-    """Depth below the surface [m], shape (n,); impossible pressures are NaN."""
-    possible = np.isfinite(pressure) & (pressure >= PLAUSIBLE[0])
-    return np.where(possible, (pressure - surface) / (density * GRAVITY), np.nan)
-
-
+FRESH = 1000.0  # density of water of specific gravity 1 [kg/m3]
 CLOCK = "autopilot's boot time"
 BODY = "vehicle: forward, starboard, down"
 MAGNETIC = "vehicle relative to magnetic north, east, down"
@@ -70,40 +30,25 @@ def declination(parameters: Mapping[str, float]) -> float:
     return parameters.get("COMPASS_DEC", 0.0)
 
 
-def depth_of(
-    instance: int, pressure: Array, parameters: Mapping[str, float], label: str
-) -> tuple[Array, str, bool, Zero | None]:
-    """Depth of a pressure sensor.
+def water_settings(instance: int, parameters: Mapping[str, float]) -> tuple[dict[str, float], list[str]]:
+    """Section ``depth`` of a configuration, as an autopilot states surface and density, and warnings.
 
     Parameters
     ----------
-    instance : of the barometer, from 0
-    pressure : ndarray, shape (n,) [Pa]
+    instance : of the pressure sensor, from 0
     parameters : of the autopilot
-    label : of the sensor, for people
-
-    Returns
-    -------
-    depth, ndarray, shape (n,) [m]; what it rests on, for people; whether that is the autopilot's own word; the surface
-    where it is guessed
     """
-    surface, found, good = surface_of(instance, pressure, parameters)
-    density = density_of(parameters)
-    water = f"water of {density:.0f} kg/m3" + ("" if "BARO_SPEC_GRAV" in parameters else " for want of BARO_SPEC_GRAV")
-    said = f"{label}: surface pressure {surface / 100.0:.1f} hPa ({found}), {water}"
-    zero = None if good else zero_of(surface, density, said)
-    return depth(pressure, surface, density), said, good and "BARO_SPEC_GRAV" in parameters, zero
-
-
-def surface_of(instance: int, pressure: Array, parameters: Mapping[str, float]) -> tuple[float, str, bool]:
-    """Pressure at the surface [Pa], by `surface_pressure`; arguments of `depth_of`."""
+    found: dict[str, float] = {}
+    warnings = []
     names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
-    return surface_pressure(next((parameters[name] for name in names if name in parameters), None), pressure)
-
-
-def density_of(parameters: Mapping[str, float]) -> float:
-    """Of the water, as an autopilot's parameters state it; else fresh [kg/m3]."""
-    return FRESH * parameters.get("BARO_SPEC_GRAV", 1.0)
+    name = next((name for name in names if name in parameters), "")
+    if name and LEAST <= parameters[name] <= MOST:
+        found["surface_hpa"] = round(0.01 * parameters[name], 3)
+    elif name:
+        warnings.append(f"{name} states {0.01 * parameters[name]:.0f} hPa, which no air has: it is not used")
+    if "BARO_SPEC_GRAV" in parameters:
+        found["density_kgm3"] = round(FRESH * parameters["BARO_SPEC_GRAV"], 2)
+    return found, warnings
 
 
 def thrusters(outputs: Mapping[int, Array], parameters: Mapping[str, float]) -> dict[str, Array]:

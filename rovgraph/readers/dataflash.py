@@ -26,11 +26,11 @@ from rovgraph.readers.ardupilot import (
     RANGE_SD_M,
     SPEED_ESTIMATE_AXES,
     declination,
-    depth_of,
     new_fixes,
     one_point,
     settings,
     thrusters,
+    water_settings,
 )
 from rovgraph.readers.dataflash_messages import FMT, HEAD, INSTANCE, Contents, DataflashMessages, read_messages, texts
 from rovgraph.readers.formats import ReadingOptions
@@ -78,7 +78,7 @@ class Findings:
     ----------
     notes, warnings : a sentence each
     undeclared : fields without a unit in the log
-    environment : of the configuration
+    environment, depth : of the configuration
     left : number of messages that were left, by name and reason
     """
 
@@ -86,6 +86,7 @@ class Findings:
     warnings: list[str] = field(default_factory=list)
     undeclared: set[str] = field(default_factory=set)
     environment: dict[str, float] = field(default_factory=dict)
+    depth: dict[str, float] = field(default_factory=dict)
     left: Counter[tuple[str, str]] = field(default_factory=Counter)
 
 
@@ -247,11 +248,11 @@ def attitude(source: DataflashSource) -> Channel | None:
 
 
 def barometer(source: DataflashSource) -> Channel | None:
-    """BARO: depth from pressure."""
-    pressure = np.asarray(source.si("Press"), dtype=float)
-    found, said, good, zero = depth_of(source.instance, pressure, source.parameters, source.label)
-    (source.findings.notes if good else source.findings.warnings).append(said)
-    return replace(source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press"), zero=zero)
+    """BARO: pressure; what the autopilot states of surface and water goes into the configuration."""
+    found, warnings = water_settings(source.instance, source.parameters)
+    source.findings.depth |= found
+    source.findings.warnings += warnings
+    return source.channel("depth", {"time": source.time("SMS", 1e-3), "pressure": source.si("Press")}, "Press")
 
 
 def rangefinder(source: DataflashSource) -> Channel | None:
@@ -407,7 +408,7 @@ class DataFlash:
             tuple(made),
             {CLOCK: clock},
             _left(contents, findings),
-            known | ({"environment": environment} if environment else {}),
+            known | {name: of for name, of in (("environment", environment), ("depth", findings.depth)) if of},
             tuple(findings.notes),
             (*findings.warnings, *unknown),
         )

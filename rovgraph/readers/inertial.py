@@ -256,7 +256,7 @@ def recording_of_inertial(
         account.warnings.append(f"the IMU's axes are taken as {axes}, as gravity has it: check the mounting")
         account.warnings += too_slow(imu.time, imu.label, "export at 50 Hz or more")
     if "ahrs" in first and first["ahrs"].true_north:
-        settings["environment"] = {"declination_deg": 0.0}
+        settings["heading"] = {"ahrs_reference": "true"}
     account.warnings += [each.warning for each in first.values() if each.warning]
     left = tuple(Left(name, count, why) for (name, why), count in sorted(account.left.items()) if count)
     said = tuple(dict.fromkeys(account.notes)), tuple(dict.fromkeys(account.warnings))

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +17,11 @@ from rovgraph.readers.ardupilot import (
     ONE_POINT,
     SPEED_ESTIMATE_AXES,
     declination,
-    depth_of,
     new_fixes,
     one_point,
     settings,
     thrusters,
+    water_settings,
 )
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.mavlink import OF_PARAMETERS, PRESSURES, SLOW, UNIX_USEC, Gatherer, MavlinkRows, Sender
@@ -82,7 +81,7 @@ def recording(path: Path, format_: str, gatherer: Gatherer, receiver: str, optio
         tuple(made),
         vehicle.clocks(made),
         tuple(vehicle.left(gatherer)),
-        known | ({"environment": environment} if environment else {}),
+        known | {name: of for name, of in (("environment", environment), ("depth", vehicle.depth)) if of},
         tuple(vehicle.notes),
         (*warnings, *unknown),
     )
@@ -109,6 +108,7 @@ class _Vehicle:
         self.warnings: list[str] = []
         self.refused: Counter[tuple[str, str]] = Counter()
         self.environment: dict[str, float] = {}
+        self.depth: dict[str, float] | None = None  # of the sensor in the water
         self._path, self._receiver, self._choose = path, receiver, options.choose
         self._clock = self._boots()
 
@@ -236,10 +236,10 @@ class _Vehicle:
         yield self._channel(sensor, rows, {**rows.columns, "ahrs_yaw": magnetic}, MAGNETIC)
 
     def _depth(self, sensor: str, rows: MavlinkRows) -> Iterator[Channel]:
-        instance = PRESSURES.index(rows.name)
-        found, said, good, zero = depth_of(instance, rows.columns["pressure"], self.parameters, rows.name)
-        (self.notes if good else self.warnings).append(said)
-        yield replace(self._channel(sensor, rows, {"depth": found}, ""), zero=zero)
+        found, warnings = water_settings(PRESSURES.index(rows.name), self.parameters)
+        self.depth = found if self.depth is None else self.depth
+        self.warnings += warnings
+        yield self._channel(sensor, rows, rows.columns, "")
 
     def _velocity(self, sensor: str, rows: MavlinkRows) -> Iterator[Channel]:
         if rows.name == "VISION_SPEED_ESTIMATE":

@@ -19,7 +19,7 @@ from rovgraph.log import Log
 from rovgraph.log.disk_columns import in_pieces, median_step
 from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, in_order, whole
 from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON
-from rovgraph.model.config import leaves
+from rovgraph.model.config import Config, leaves
 from rovgraph.readers.clocks import BASES, JoinedClock, join_clocks
 from rovgraph.readers.lag_search import MotionSignals
 from rovgraph.readers.lag_search import motion_of as motion_of_log
@@ -29,6 +29,7 @@ from rovgraph.readers.stamps import by_arrival, put_in_order
 
 OF_INSTRUMENT = (
     "imu",
+    "ahrs",
     "dvl",
     "depth",
     "fix",
@@ -37,6 +38,7 @@ OF_INSTRUMENT = (
 )  # sections of settings that belong to the channel of this sensor
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
 ARRIVAL, EVERY = "arrival", ""  # whose times are taken, and of what: a sensor, a file, or every one
+ANY_SURFACE = Config().changed(depth={"surface_hpa": 0.0})  # motion of pressures needs none
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix", "usbl", "range")  # sensors with a calibration variable for it
 
 
@@ -239,7 +241,7 @@ def _motion(channels: Sequence[Channel]) -> MotionSignals:
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore")  # the log that is made of them is read again
         try:
-            log = Log.from_rows(in_order([channel.columns for channel in first.values()]))
+            log = Log.from_rows(in_order([channel.columns for channel in first.values()]), ANY_SURFACE)
         except InputError:
             return MotionSignals((), None)
     return motion_of_log(log)
@@ -253,7 +255,8 @@ def _settings(
     out: dict[str, tuple[Any, str]] = {}
     for k, (recording, name) in enumerate(zip(recordings, file_names(recordings), strict=True)):
         for path, value in leaves(recording.settings):
-            if path[0] not in OF_INSTRUMENT or feeds.get(path[0]) == k:
+            instrument = path[1].partition("_")[0] if path[0] == "heading" else path[0]  # heading.ahrs_reference
+            if instrument not in OF_INSTRUMENT or feeds.get(instrument) == k:
                 out.setdefault(".".join(path), (value, name))
     stamps = {
         each.channel.sensor: next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))

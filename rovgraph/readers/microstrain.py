@@ -37,7 +37,7 @@ from rovgraph.readers.text_table import TextLayout, TextTable, cells_of, read_ta
 START = b"DATA_START"
 DESCRIPTOR = re.compile(r"^(.*?)\s*\[x([0-9A-F]{4})\]$", re.IGNORECASE)
 CORRECTED = "values are corrected by the instrument's own filter; record the scaled ones for a filter of ours"
-NORTH = "the yaw is taken relative to magnetic north; state declination_deg: 0 if the instrument adds a declination"
+NORTH = "the yaw is taken relative to magnetic north; if not, state heading.ahrs_reference: true"
 
 
 def _field(descriptor: str, *names: str) -> tuple[str, ...]:

@@ -288,7 +288,7 @@ class _Sentences:
 
     def _look(self, channels: list[Channel], said: list[str]) -> tuple[dict[str, Any], list[str]]:
         """Settings from the file, and possible errors beside ``said``."""
-        warnings, environment = [*said], {}
+        warnings, environment, settings = [*said], {}, {}
         talkers = [channel.source for channel in channels if channel.sensor == "fix"]
         if talkers:
             others = f" (also: {', '.join(talkers[1:])}; choose fix=NAME)" if len(talkers) > 1 else ""
@@ -300,11 +300,7 @@ class _Sentences:
             stamped = "" if heading.source == "PASHR" else "stamped by its place between sentences with a time; "
             warnings.append(f"{heading.source}: {stamped}see that it is of the vehicle")
             if heading.source.endswith(TRUE):
-                kind = heading.source if heading.source in ATTITUDES else heading.source[-3:]
-                warnings.append(
-                    f"{kind} is relative to true north, a log's ahrs_yaw to magnetic: set declination_deg to 0"
-                )
-                environment["declination_deg"] = 0.0
+                settings["heading"] = {"ahrs_reference": "true"}
             elif self._variation:
                 environment["declination_deg"] = float(np.median(self._variation))
-        return {"environment": environment} if environment else {}, warnings
+        return settings | ({"environment": environment} if environment else {}), warnings

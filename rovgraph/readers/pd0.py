@@ -419,8 +419,7 @@ def _with(made: Recording, receiver: _Receiver) -> Recording:
     if len(receiver.heading):
         pointing = {"time": receiver.heading_time, "ahrs_yaw": receiver.heading}
         more.append(Channel("ahrs", pointing, "HDT sentences", "the vessel's, true north", UTC))
-        settings["environment"] = {**settings.get("environment", {}), "declination_deg": 0.0}
-        warnings.append("HDT is relative to true north, a log's ahrs_yaw to magnetic: set declination_deg to 0")
+        settings["heading"] = {"ahrs_reference": "true"}
     clocks = {**made.clocks, UTC: Clock(UTC, 0.0, 0.0, "its stamps are Unix time")}
     return replace(
         made,

@@ -43,28 +43,12 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Zero:
-    """The surface that depths count from, where it was taken from the pressures of the same file.
-
-    Attributes
-    ----------
-    depth : of water that weighs as much as the pressure that was taken off [m]
-    said : its sentence in `Recording.warnings`
-    measured : False = the standard atmosphere, as nothing was measured near the surface
-    """
-
-    depth: float
-    said: str
-    measured: bool
-
-
-@dataclass(frozen=True)
 class Channel:
     """Measurements of one sensor, as columns of a log (docs/log-format.md).
 
     Attributes
     ----------
-    sensor : name of its stream in a log ("imu", "dvl", "depth", ...)
+    sensor : name of its stream in a log ("imu", "dvl", "depth", ...); one of "depth" may have the column ``pressure``
     columns : column -> ndarray, shape (n,), SI and radians, ``time`` [s] among them; NaN = not valid. Not to be
         changed: long ones are in temporary files (`rovgraph.log.disk_columns`)
     source : where in the file it comes from, such as "IMU instance 0: AccX, AccY, AccZ, GyrX, GyrY, GyrZ"
@@ -72,7 +56,6 @@ class Channel:
     clock : name of the `Clock` that stamps it
     received : when each row arrived, on the clock ``receiver``, ndarray, shape (n,); None = not recorded
     receiver : name of the `Clock` of ``received``
-    zero : of depths, where the file does not state it: pieces of one recording share the least
     """
 
     sensor: str
@@ -82,7 +65,6 @@ class Channel:
     clock: str = ""
     received: Array | None = None
     receiver: str = ""
-    zero: Zero | None = None
 
 
 def in_files(channel: Channel) -> Channel:

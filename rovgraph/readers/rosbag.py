@@ -22,9 +22,9 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.log.disk_columns import FlatTable, computed, every, taken
 from rovgraph.readers import rosbag_messages as nucleus
-from rovgraph.readers.ardupilot import ONE_POINT, depth, new_fixes, one_point, surface_pressure, zero_of
+from rovgraph.readers.ardupilot import ONE_POINT, new_fixes, one_point
 from rovgraph.readers.formats import ReadingOptions
-from rovgraph.readers.recording import Channel, Clock, Left, Recording, Zero, in_files, preferred_first, too_slow
+from rovgraph.readers.recording import Channel, Clock, Left, Recording, in_files, preferred_first, too_slow
 from rovgraph.readers.rosbag_messages import CLOCK as NUCLEUS
 from rovgraph.readers.rosbag_messages import (
     COLUMNS,
@@ -103,7 +103,6 @@ def _rounded(values: Array, digits: int) -> list[float]:
 HEADERS, RECORDER = "headers of messages", "recorder"
 LATENCY_SD_S = 0.05
 SOME = 10_000  # messages enough for a judgement
-SEA = 1025.0  # density of water [kg/m3]
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -177,7 +176,6 @@ class _Made:
         self._path, self._frames, self._choose = path, frames, options.choose
         self._mountings: dict[str, Mounting | None] = {}  # of the preferred topic of a sensor
         self.assumed: dict[str, str] = {}
-        self._zeros: dict[str, Zero] = {}  # by topic
 
     def of(self, sensor: str, topics: Mapping[str, Topic]) -> Iterator[Channel]:
         """All topics with sensor data, the preferred one first."""
@@ -212,13 +210,12 @@ class _Made:
         if first:
             self._mountings[sensor] = self._frames.mounting(topic.frame)
         source = f"{topic.name} ({topic.type})"
-        zero = self._zeros.get(topic.name) if sensor == "depth" else None
-        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER, zero))
+        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER))
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
             told = topic.clock == NUCLEUS  # others have pressure
-            return {"depth": values[:, 0] if told else self._depth(topic, values[:, 0])}
+            return {"depth": values[:, 0]} if told else {"pressure": self._pascal(topic, values[:, 0])}
         if sensor == "ahrs":
             return self._attitude(topic, values)
         return dict(zip(COLUMNS[sensor], values.T, strict=True))
@@ -260,18 +257,13 @@ class _Made:
             self.left.append(Left(name, int((~new).sum()), "nowhere on Earth, or the one before repeated"))
         return new
 
-    def _depth(self, topic: Topic, pressure: Array) -> Array:
+    def _pascal(self, topic: Topic, pressure: Array) -> Array:
         typical = float(np.nanmedian(pressure))
         for factor, unit, high in ((1e3, "kPa", 850.0), (1e2, "hPa", 50_000.0)):
             if 90.0 < typical < high:
                 self.warnings.append(f"{topic.name}: pressures of {typical:.0f} are taken for {unit}, not Pa")
-                pressure = factor * pressure
-                break
-        surface, said, _ = surface_pressure(None, pressure)
-        at = f"{surface / 100.0:.0f} hPa at the surface ({said})"
-        self.warnings.append(f"{topic.name}: depth against {at}, in water of {SEA:.0f} kg/m3")
-        self._zeros[topic.name] = zero_of(surface, SEA, self.warnings[-1])
-        return depth(pressure, surface, SEA)
+                return factor * pressure
+        return pressure
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
         """The IMU's axes relative to NED; gravity shows whether the messages' world has z up or down."""

@@ -359,8 +359,6 @@ def _joined(members: Sequence[_File]) -> Recording:
     assumed = {key: text for each in reversed(parts_of) for key, text in each.assumed.items() if key not in known}
     untold = {text for each in parts_of for text in each.assumed.values()} - set(assumed.values())
     channels = [_one(parts) for parts in found.values()]
-    untold |= {part.zero.said for parts in found.values() for part in parts if part.zero is not None}
-    untold -= {channel.zero.said for channel in channels if channel.zero is not None}
     warnings = dict.fromkeys(text for each in parts_of for text in each.warnings if text not in untold)
     return replace(
         first.recording,
@@ -384,15 +382,7 @@ def _of_tables(member: _File, first: _File) -> float:
 
 def _one(parts: Sequence[Channel]) -> Channel:
     received = None if any(p.received is None for p in parts) else np.concatenate([p.received for p in parts])
-    columns = [part.columns for part in parts]
-    zeros = [part.zero for part in parts if part.zero is not None]
-    zero = min(zeros, key=lambda each: (not each.measured, each.depth), default=None)
-    if zero is not None:  # only one piece may have been at the surface
-        columns = [
-            c if p.zero is None else {**c, "depth": c["depth"] + (p.zero.depth - zero.depth)}
-            for c, p in zip(columns, parts, strict=True)
-        ]
-    return replace(parts[0], columns=_stacked(columns), received=received, zero=zero)
+    return replace(parts[0], columns=_stacked([part.columns for part in parts]), received=received)
 
 
 def _stacked(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

@@ -28,9 +28,7 @@ from rovgraph.readers.inertial import (
 from rovgraph.readers.recording import Clock, Recording
 from rovgraph.readers.text_table import TextLayout, TextTable, cells_of, read_table
 
-NORTH = (
-    "the yaw is taken relative to magnetic north, which that of a VN-100 is; state declination_deg: 0 for one with GNSS"
-)
+NORTH = "the yaw is taken relative to magnetic north, as a VN-100 has it; else state heading.ahrs_reference: true"
 
 
 def _imu(label: str, acc: str, gyr: str) -> InertialSource:

@@ -273,7 +273,7 @@ def _measured(kind: str, table: Array) -> list[InertialMeasurement]:
     if kind in YAW_PITCH_ROLL:
         first, true = YAW_PITCH_ROLL[kind], kind in TRUE_NORTH
         angles = np.deg2rad(cells[:, first : first + 3])[:, ::-1]
-        north = "its yaw is relative to true north, a log's to magnetic: declination_deg is set to 0" if true else NORTH
+        north = "its yaw is relative to true north" if true else NORTH
         found.append(InertialMeasurement("ahrs", name, time, angles, f"{name}: {north}", true_north=true))
     if kind in QUATERNIONS:
         found.append(attitude_of(name, time, cells[:, :4]))

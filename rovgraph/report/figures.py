@@ -42,6 +42,7 @@ from rovgraph.report.style import (
     thin,
 )
 from rovgraph.report.units import nice_step, plus_minus
+from rovgraph.sensors.compass import declination
 
 COLUMNS = 3
 SETTLED = 0.25  # of the dive; what is before it may leave the panel
@@ -297,17 +298,17 @@ def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tu
     prior = beliefs(config)
     R_dvl = matrix_from_rpy([float(prior[f"dvl_{angle}"].mean[0]) for angle in ("roll", "pitch", "yaw")])
     R_imu = mount_matrix(config.imu.mount_rpy_deg)
-    declination = np.deg2rad(config.environment.declination_deg)
     out = {}
     for sensor, column, R_bs in (("ahrs", "ahrs_yaw", R_imu), ("dvl_heading", "dvl_heading", R_dvl)):
         if sensor in log:
             some = thin(len(log[sensor]), MOST_SAMPLES)
             azimuth = np.arctan2(R_bs[1, 0], R_bs[0, 0])
-            out[sensor] = (log[sensor].time[some], log[sensor][column][some] + declination - azimuth)
+            out[sensor] = (log[sensor].time[some], log[sensor][column][some] + declination(config, sensor) - azimuth)
     if "mag" in log:
         some = thin(len(log["mag"]), MOST_SAMPLES)
         time = log["mag"].time[some]
-        out["mag"] = (time, _levelled(track.clamped(time), rotate(R_imu, log["mag"].data[some])) + declination)
+        magnetic = _levelled(track.clamped(time), rotate(R_imu, log["mag"].data[some]))
+        out["mag"] = (time, magnetic + declination(config, "mag"))
     return out
 
 

@@ -20,16 +20,17 @@ from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instru
 
 @dataclass(frozen=True)
 class CompassHeading:
-    """Magnetic heading of an instrument's x axis with its deviation curve.
+    """Heading of an instrument's x axis with its deviation curve.
 
     Attributes
     ----------
     sensor : "ahrs", "dvl_heading" or "vehicle_heading"
     offset, curve : names of its calibration variables
-    declination : [rad], east positive; one for all epochs or for each
+    declination : of the north that it is relative to [rad], east positive; one for all epochs or for each
     R_bs : ndarray, shape (3, 3), mounting of the instrument; the DVL's own comes from
         the calibration variables instead
     error : name of the variable of its error that lasts, or None
+    gradient : change of the declination by metres north and east [rad/m]
     """
 
     sensor: str
@@ -38,6 +39,7 @@ class CompassHeading:
     declination: float | Array
     R_bs: Array = field(default_factory=lambda: np.eye(3))
     error: str | None = None
+    gradient: tuple[float, float] = (0.0, 0.0)
     dim = 1
     angular = True
     state = (POSE, BIAS)
@@ -53,39 +55,69 @@ class CompassHeading:
 
     @cached_property
     def packed(self) -> Array:
-        """Declination, places of offset, curve and error (or -1) in the calibration vector, the x axis in b."""
+        """Declination, places of offset, curve, error (or -1) in the calibration vector, the x axis in b, gradient."""
         declination = np.atleast_1d(self.declination)
         error = -1 if self.error is None else LAYOUT[self.error].start
-        constants = LAYOUT[self.offset].start, LAYOUT[self.curve].start, error, *self.R_bs[:, 0]
+        constants = LAYOUT[self.offset].start, LAYOUT[self.curve].start, error, *self.R_bs[:, 0], *self.gradient
         return np.column_stack([declination, np.tile(constants, (len(declination), 1))])
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)
 
 
+def reference(config: Config, sensor: str) -> str | None:
+    """North that a compass is relative to: "magnetic", "true" or "grid"; None = not stated."""
+    return "magnetic" if sensor == "mag" else getattr(config.heading, f"{sensor.partition('_')[0]}_reference")
+
+
+def declination(config: Config, sensor: str) -> float:
+    """Of the north that a compass is relative to, from true north [rad], east positive."""
+    env = config.environment
+    others = {"true": 0.0, "grid": env.convergence_deg or 0.0}
+    return float(np.deg2rad(others.get(reference(config, sensor) or "magnetic", env.declination_deg)))
+
+
+def gradient(config: Config, sensor: str) -> tuple[float, float]:
+    """Change of the declination of its north by metres north and east [rad/m]."""
+    by_km = config.environment.declination_per_km_deg
+    if by_km is None or reference(config, sensor) in ("true", "grid"):
+        return 0.0, 0.0
+    return float(np.deg2rad(1e-3 * by_km[0])), float(np.deg2rad(1e-3 * by_km[1]))
+
+
+def turns_true_headings(config: Config) -> bool:
+    """Whether a true heading can be given relative to the north that ``ahrs_yaw`` is relative to."""
+    return reference(config, "ahrs") != "magnetic" or "declination_deg" in config.environment.model_fields_set
+
+
+TRUE_NORTH = "it is relative to true north: state heading.ahrs_reference: true, or environment.declination_deg"
+
+
 def of_imu(config: Config, origin_b: Array) -> Instrument:
     """The heading that the IMU makes itself."""
-    declination = float(np.deg2rad(config.environment.declination_deg))
-    R_bs = mount_matrix(config.imu.mount_rpy_deg)
-    model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_bs, "ahrs_error")
+    north, R_bs = declination(config, "ahrs"), mount_matrix(config.imu.mount_rpy_deg)
+    model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", north, R_bs, "ahrs_error", gradient(config, "ahrs"))
     sd = np.deg2rad(config.heading.ahrs_sd_deg)
     return instrument(config.heading, model, sd, ("heading",), time_offset="ahrs_time_offset")
 
 
 def of_dvl(config: Config, origin_b: Array) -> Instrument:
     """The heading of the DVL's compass."""
-    declination = float(np.deg2rad(config.environment.declination_deg))
-    names = "dvl_compass_offset", "dvl_compass_deviation"
-    model = CompassHeading("dvl_heading", *names, declination, error="dvl_compass_error")
+    north, names = declination(config, "dvl_heading"), ("dvl_compass_offset", "dvl_compass_deviation")
+    model = CompassHeading(
+        "dvl_heading", *names, north, error="dvl_compass_error", gradient=gradient(config, "dvl_heading")
+    )
     sd = np.deg2rad(config.heading.dvl_sd_deg)
     return instrument(config.heading, model, sd, ("heading",), time_offset=TIME_OFFSET)
 
 
 def of_vehicle(config: Config, origin_b: Array) -> Instrument:
     """The heading of the body as the vehicle's own navigation gives it."""
-    declination = float(np.deg2rad(config.environment.declination_deg))
+    north = declination(config, "vehicle_heading")
     names = "vehicle_compass_offset", "vehicle_compass_deviation"
-    model = CompassHeading("vehicle_heading", *names, declination, error="vehicle_compass_error")
+    model = CompassHeading(
+        "vehicle_heading", *names, north, error="vehicle_compass_error", gradient=gradient(config, "vehicle_heading")
+    )
     return instrument(config.heading, model, np.deg2rad(config.heading.vehicle_sd_deg), ("heading",))
 
 

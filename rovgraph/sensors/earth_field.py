@@ -4,12 +4,14 @@ Source: NOAA/NCEI and BGS, World Magnetic Model 2025, with its error model; comp
 """
 
 import datetime as dt
+import math
 from functools import cache
 from typing import Any, NamedTuple
 
 BLACKOUT_NT, CAUTION_NT = 2000.0, 6000.0  # horizontal field below which a compass shows nothing, or little
 FLOOR_DEG = 0.5  # sd of the declination: rock near shores and magnetic storms are beyond the model's own
 SPAN = 2025.0, 2030.0  # years of the model
+STEP_KM, KM_PER_DEG = 10.0, 111.2
 
 
 class EarthField(NamedTuple):
@@ -47,6 +49,17 @@ def decimal_year(unix: float) -> float:
     day = dt.datetime.fromtimestamp(unix, dt.UTC)
     begin, end = (dt.datetime(day.year + k, 1, 1, tzinfo=dt.UTC) for k in (0, 1))
     return day.year + (day - begin) / (end - begin)
+
+
+def declination_per_km(latitude: float, longitude: float, year: float) -> tuple[float, float]:
+    """Change of the declination by a kilometre north and east [deg/km], over 10 km each way."""
+    north = STEP_KM / KM_PER_DEG
+    east = north / max(math.cos(math.radians(latitude)), 0.01)
+    changes = []
+    for by_lat, by_lon in ((north, 0.0), (0.0, east)):
+        ends = (earth_field(latitude + s * by_lat, longitude + s * by_lon, 0.0, year).declination_deg for s in (1, -1))
+        changes.append(((next(ends) - next(ends) + 180.0) % 360.0 - 180.0) / (2.0 * STEP_KM))
+    return changes[0], changes[1]
 
 
 def earth_field(latitude: float, longitude: float, depth: float, year: float) -> EarthField:

@@ -11,6 +11,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.model.state import BIAS, POSE, Jacobians, State
+from rovgraph.sensors.compass import gradient
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Said, Sensor, instrument
 
@@ -35,12 +36,14 @@ class MagneticField:
     declination, dip : [rad], declination east positive, dip down positive
     magnitude : length of the field, in the log's unit
     R_bs : ndarray, shape (3, 3), mounting of the IMU
+    gradient : change of the declination by metres north and east [rad/m]
     """
 
     declination: float
     dip: float
     magnitude: float
     R_bs: Array = field(default_factory=lambda: np.eye(3))
+    gradient: tuple[float, float] = (0.0, 0.0)
     sensor = "mag"
     dim = 3
     angular = False
@@ -50,8 +53,8 @@ class MagneticField:
 
     @cached_property
     def packed(self) -> Array:
-        """Declination, dip, magnitude, the mounting row by row."""
-        return np.array([[self.declination, self.dip, self.magnitude, *self.R_bs.ravel()]])
+        """Declination, dip, magnitude, the mounting row by row, the declination's gradient."""
+        return np.array([[self.declination, self.dip, self.magnitude, *self.R_bs.ravel(), *self.gradient]])
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)
@@ -63,7 +66,8 @@ def magnetometer(config: Config, origin_b: Array) -> Instrument:
     dip = DEFAULT_DIP if env.dip_deg is None else float(np.deg2rad(env.dip_deg))
     magnitude = 1.0 if env.field_norm is None else env.field_norm
     declination = float(np.deg2rad(env.declination_deg))
-    model = MagneticField(declination, dip, magnitude, mount_matrix(config.imu.mount_rpy_deg))
+    R_bs = mount_matrix(config.imu.mount_rpy_deg)
+    model = MagneticField(declination, dip, magnitude, R_bs, gradient(config, "mag"))
     sd = np.deg2rad(config.heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
     return instrument(config.heading, model, sd, ("x", "y", "z"), time_offset="mag_time_offset")
 

@@ -15,6 +15,9 @@ from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobia
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument, own_sd
 
+AIR_DBAR, SAME_AIR_M = (9.5, 10.5), 0.3  # of the air's pressure, and how much it changes in a dive
+DIVED_M = 2.0  # more than waves
+WAVES_REACH_M = 5.0  # over which the waves' pressure falls by e: g T^2 / (4 pi^2), of a period T of 4.5 s
 DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
 
 
@@ -68,6 +71,12 @@ def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
     return instrument(depth, model, depth.sd_m, ("down",), time_offset="depth_time_offset")
 
 
+def _with_waves(values: Array, believed: Instrument, config: Config) -> Array:
+    """Noise of a depth: near the surface the waves' pressure comes to it."""
+    waves = config.depth.waves_m
+    return np.hypot(believed.sd, waves * np.exp(-max(values[0], 0.0) / WAVES_REACH_M)) if waves else believed.sd
+
+
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
@@ -97,6 +106,12 @@ def _range(values: Array, config: Config) -> Iterator[Said]:
             "its zero was probably set under water, at the first pressure or later",
             "zero",
         )
+    ends, least = [float(np.median(some)) for some in (depth[:9], depth[-9:])], float(np.percentile(depth, 1))
+    if all(AIR_DBAR[0] < end < min(AIR_DBAR[1], least + SAME_AIR_M) for end in ends) and np.ptp(depth) > DIVED_M:
+        remedy = "if it is a pressure in dbar, name it pressure and state units: {pressure: dbar}"
+        if config.depth.surface_hpa is not None:
+            remedy = f"if it was at the surface, remove depth.surface_hpa: {config.depth.surface_hpa:g}"
+        yield "warning", f"it begins and ends at {ends[0]:.1f} m, as much as the air weighs; {remedy}", "unit"
     if np.ptp(depth) > 1000.0:
         yield "warning", f"depth spans {np.ptp(depth):.4g} m; if it is in cm or mm, state units: {{depth: mm}}", "unit"
 
@@ -106,6 +121,7 @@ DEPTH = Sensor(
     (Column("depth", "length"),),
     pressure_sensor,
     refused=_too_deep,
+    standard_deviation=_with_waves,
     once_per_interval=True,
     observes=Observed("position", (2,)),
     may_begin_later=True,

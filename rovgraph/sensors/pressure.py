@@ -3,11 +3,14 @@
     depth = x / (1 + k x / 2 g),  x = (pressure - surface) / (density g)
 
 where g is gravity at the surface and k its growth with depth (`rovgraph.kernels.earth`); the density is constant.
+Where ``sound.profile`` has temperature and salinity, depths are those of TEOS-10 (`OceanProfile`).
 Reading a log and the online mode take pressures one by one through the same `DepthByPressure`, so their depths agree.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,15 +20,22 @@ from rovgraph.geometry import Array
 from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, normal_gravity
 from rovgraph.model.config import Config
 from rovgraph.sensors.sensor import Column, Sensor
+from rovgraph.sensors.sound import SoundSpeedProfile, profile_of
 
 PRESSURE = Sensor("pressure", (Column("pressure", "pressure"),), may_begin_later=True)  # becomes the stream "depth"
+BY_PRESSURE = "depth by pressure"  # begins what a log notes of it
 STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
 LEAST, MOST = 50_000.0, 108_500.0  # of air where people dive, mountain lakes included [Pa]
+AT_SEA = 87_000.0  # least that was ever measured at sea level [Pa]
 SEA = 1025.0  # density [kg/m^3]
+PER_PSU = 35.16504 / 35.0  # of absolute salinity [g/kg]
+DEEPER_DBAR = 1000.0  # beyond a profile, whose water stays
 FRESH, BY_SALT = 999.7, 0.778  # at 10 deg C [kg/m^3], and by a psu
 BLOCK_S = 5.0  # of pressures that are looked at together
 CALM_PA = 1500.0  # spread of a block in which the vehicle keeps its depth
 SAME_PA = 1000.0  # change of the air's pressure between two stays at the surface: 10 cm of water
+WAVES_S, ENOUGH, BLOCKS = 20.0, 15, 3  # of depths at the surface: length, least samples, least number
+AT_SURFACE_M = 0.5
 GAUGE_PA = 5000.0  # least of a pressure from which the air's was taken off
 
 
@@ -99,18 +109,60 @@ class SurfacePressure:
         self._first = bool(first)
 
 
+class OceanProfile:
+    """Depth by pressure in water whose temperature and salinity are known by depth: TEOS-10, by GSW.
+
+    IOC, SCOR and IAPSO, The international thermodynamic equation of seawater - 2010. Absolute salinity is practical
+    salinity times 35.16504 / 35, without its regional anomaly.
+
+    Parameters
+    ----------
+    depth, temperature, salinity : ndarray, shape (n,) [m, deg C, psu]; beyond them they stay
+    latitude : [deg]
+    """
+
+    def __init__(self, depth: Array, temperature: Array, salinity: Array, latitude: float) -> None:
+        import gsw
+
+        self._z_from_p, self._latitude = gsw.z_from_p, latitude
+        measured = gsw.p_from_z(-np.maximum(depth, 0.0), latitude)
+        self._pressure = np.arange(0.0, measured[-1] + DEEPER_DBAR, 1.0)
+        absolute = PER_PSU * np.interp(self._pressure, measured, salinity)
+        conservative = gsw.CT_from_t(absolute, np.interp(self._pressure, measured, temperature), self._pressure)
+        self._anomaly = gsw.geo_strf_dyn_height(absolute, conservative, self._pressure, 0.0)
+
+    def depth(self, pascal: Array) -> Array:
+        """Depths [m] by pressures above the surface's, shape (n,)."""
+        dbar = 1e-4 * pascal
+        anomaly = np.interp(dbar, self._pressure, self._anomaly)
+        return np.asarray(-self._z_from_p(dbar, self._latitude, anomaly))
+
+
+@cache
+def _ocean(profile: SoundSpeedProfile, latitude: float) -> OceanProfile | None:
+    """Of a profile; None where it has no temperature and salinity, or GSW is not installed."""
+    if profile.water is None:
+        return None
+    try:
+        return OceanProfile(profile.depth, profile.water[0], profile.water[1], latitude)
+    except ImportError:
+        return None
+
+
 class DepthByPressure:
     """Turns pressures into depths, one by one.
 
     Parameters
     ----------
-    config : has ``depth.surface_hpa``, ``depth.density_kgm3`` and ``environment``
+    config : has ``depth.surface_hpa``, ``depth.density_kgm3``, ``sound`` and ``environment``
     """
 
     def __init__(self, config: Config) -> None:
         stated = config.depth.surface_hpa
         self.surface = SurfacePressure(None if stated is None else 100.0 * stated)
         self._environment, self._density = config.environment, density(config)
+        profile = profile_of(config.sound.profile) if config.depth.density_kgm3 is None else None
+        self._profile = profile if profile is not None and profile.water is not None else None
 
     def take(self, time: float, pascal: float) -> float:
         """Pressure at the surface, after a pressure [Pa]; NaN = not known yet."""
@@ -130,8 +182,11 @@ class DepthByPressure:
         normal = env.gravity_mps2 is None and latitude is not None
         gravity = float(normal_gravity(np.deg2rad(latitude))) if normal else env.gravity  # type: ignore[arg-type]
         surface = np.where(np.isnan(surface), STANDARD, surface)
-        x = (pascal - surface) / (self._density * gravity)
         possible = np.isfinite(pascal) & (pascal >= np.minimum(surface - GAUGE_PA, LEAST))
+        ocean = None if self._profile is None else _ocean(self._profile, 45.0 if latitude is None else latitude)
+        if ocean is not None:
+            return np.where(possible, ocean.depth(np.where(possible, pascal - surface, 0.0)), np.nan)
+        x = (pascal - surface) / (self._density * gravity)
         return np.where(possible, x / (1.0 + (GRAVITY_PER_DEPTH if normal else 0.0) * x / (2.0 * gravity)), np.nan)
 
     def says(self, surface: Array) -> str:
@@ -140,7 +195,12 @@ class DepthByPressure:
         how = "as stated" if not self.surface._finds else "found where the vehicle was there"
         what = f"{known.min() / 100.0:.1f} to {known.max() / 100.0:.1f} hPa, {how}" if len(known) else ""
         what = what or f"{STANDARD / 100.0:.1f} hPa, the standard atmosphere, as the vehicle was never there"
-        return f"depth by pressure: at the surface {what}; water of {self._density:.0f} kg/m3"
+        water = f"water of {self._density:.0f} kg/m3"
+        if self._profile is not None and _ocean(self._profile, 45.0) is not None:
+            water = "water of sound.profile, by TEOS-10"
+        elif self._profile is not None:
+            water += ", as its profile needs GSW; install it with: pip install 'rovgraph[teos10]'"
+        return f"{BY_PRESSURE}: at the surface {what}; {water}"
 
 
 def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -> tuple[Array, str]:
@@ -156,7 +216,29 @@ def depths(time: Array, pascal: Array, config: Config, latitude: float | None) -
     return by.depth(pascal, surface, latitude), by.says(surface)
 
 
-def complaints(pascal: Array, factor: float, units: dict[str, float], source: str) -> Iterator[str]:
+def waves_at_surface(time: Array, depth: Array) -> float:
+    """Scatter of depths while the vehicle is at the surface, about their line in each block, sd [m]; 0 = too few.
+
+    Parameters
+    ----------
+    time, depth : shape (n,)
+    """
+    found = []
+    bounds = np.searchsorted(time, np.arange(time[0], time[-1], WAVES_S))
+    for begin, end in pairwise(bounds.tolist()):
+        t, z = time[begin:end], depth[begin:end]
+        if len(t) >= ENOUGH and abs(np.median(z)) < AT_SURFACE_M:
+            line = np.column_stack([np.ones(len(t)), t - t[0]])
+            found.append(float(np.std(z - line @ np.linalg.lstsq(line, z)[0])))
+    return float(np.median(found)) if len(found) >= BLOCKS else 0.0
+
+
+def units_of_air(number: float, units: Mapping[str, float]) -> list[str]:
+    """Units, of those with their factors to pascals, in which a number is the air's pressure at sea level."""
+    return [unit for unit, factor in units.items() if AT_SEA <= number * factor <= MOST]
+
+
+def complaints(pascal: Array, factor: float, units: Mapping[str, float], source: str) -> Iterator[str]:
     """Doubts about pressures in a log that states no ``depth.surface_hpa``, a line each.
 
     Parameters
@@ -170,7 +252,7 @@ def complaints(pascal: Array, factor: float, units: dict[str, float], source: st
     InputError : they are no absolute pressures
     """
     least, most = (float(np.nanquantile(pascal, q)) for q in (0.01, 0.99))
-    meant = [unit for unit, to_pascal in units.items() if 87_000.0 <= least / factor * to_pascal <= MOST]
+    meant = units_of_air(least / factor, units)
     better = f"state units: {{pressure: {meant[-1]}}}" if meant else ""
     if least > MOST:
         hint = f"if it was at the surface, the unit is {meant[-1]}: {better}" if meant else "state depth.surface_hpa"

@@ -67,13 +67,14 @@ class SoundSpeedProfile:
     Parameters
     ----------
     depth, speed : ndarray, shape (n,), depth increasing [m], [m/s]
+    water : temperature [deg C] and salinity [psu], ndarray, shape (n,) each; None = not known
 
     Raises
     ------
     InputError : depths that do not increase, speeds of no water
     """
 
-    def __init__(self, depth: Array, speed: Array) -> None:
+    def __init__(self, depth: Array, speed: Array, water: tuple[Array, Array] | None = None) -> None:
         if len(depth) < 2 or not (np.diff(depth) > 0.0).all() or depth[0] < -BEYOND_M:
             raise InputError(
                 "sound.profile: expected two or more depths that increase, in metres and positive down; "
@@ -84,7 +85,7 @@ class SoundSpeedProfile:
                 f"sound.profile: speeds from {speed.min():.0f} to {speed.max():.0f}, expected {SLOWEST_MPS:.0f} to "
                 f"{FASTEST_MPS:.0f} m/s; 1 ft/s is 0.3048 m/s"
             )
-        self.depth, self.speed = depth, speed
+        self.depth, self.speed, self.water = depth, speed, water
 
     def mean(self, upper: Array, lower: Array) -> Array:
         """Harmonic mean of the speed between two depths each, shape (n,) [m/s]."""
@@ -161,12 +162,14 @@ def _read(path: Path) -> SoundSpeedProfile:
     table.columns = [str(name).strip().lower() for name in table.columns]
     if "depth" not in table or not ({"sound_speed"} <= {*table} or {"temperature", "salinity"} <= {*table}):
         raise InputError(f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity")
-    columns = ["depth", "sound_speed"] if "sound_speed" in table else ["depth", "temperature", "salinity"]
+    columns = [name for name in ("depth", "sound_speed", "temperature", "salinity") if name in table]
     try:
         table = table[columns].dropna().astype(float)
     except ValueError as error:
         raise InputError(f"{path}: {', '.join(columns)} are no numbers ({error})") from None
     depth = table["depth"].to_numpy(float)
-    if "sound_speed" in table:
-        return SoundSpeedProfile(depth, table["sound_speed"].to_numpy(float))
-    return SoundSpeedProfile(depth, sound_speed(table["salinity"].to_numpy(), table["temperature"].to_numpy(), depth))
+    water = None
+    if {"temperature", "salinity"} <= {*table}:
+        water = table["temperature"].to_numpy(), table["salinity"].to_numpy()
+    speed = table["sound_speed"].to_numpy() if "sound_speed" in table else sound_speed(water[1], water[0], depth)  # type: ignore[index]
+    return SoundSpeedProfile(depth, speed, water)

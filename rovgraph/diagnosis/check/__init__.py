@@ -16,19 +16,20 @@ import numpy as np
 from rovgraph.diagnosis.check import acoustics
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
-from rovgraph.diagnosis.check.compasses import body_heading
+from rovgraph.diagnosis.check.compasses import body_heading, field_of_place
 from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, ranges
 from rovgraph.diagnosis.check.findings import Finding, Report, Timing, since
 from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
-from rovgraph.inference.initialise import field_by_place
+from rovgraph.inference.initialise import declination_by_place, with_convergence
 from rovgraph.log import Log
 from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import motion_model
 from rovgraph.sensors import SENSORS, Level
+from rovgraph.sensors.compass import reference
 from rovgraph.sensors.earth_field import BLACKOUT_NT
 from rovgraph.sensors.instruments import heading_sources
 
@@ -88,9 +89,12 @@ def _assumptions(log: Log, config: Config, sources: list[str]) -> Iterator[str]:
 
 def _north(log: Log, config: Config) -> str:
     """What is taken for north where no declination is stated."""
-    field = field_by_place(log, config)
+    field = declination_by_place(log, config)
     if field is None or field.horizontal_nt <= BLACKOUT_NT:
-        return "magnetic north is taken as north"
+        unstated = [source for source in heading_sources(config, log.sensors) if reference(config, source) is None]
+        key = f"heading.{unstated[0].partition('_')[0]}_reference" if unstated else ""
+        why = f"{key} is not given" if unstated else "the log has no place or no date"
+        return f"magnetic north is taken as north, as {why}"
     return f"{field.declination_deg:.2f} by WMM2025 at the origin and the date of the log"
 
 
@@ -129,6 +133,7 @@ CHECKS: tuple[Check, ...] = (
     turn_rates,
     angles,
     headings,
+    field_of_place,
     own,
     standstill,
     frozen_imu,
@@ -159,7 +164,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     config : what is believed of the vehicle; defaults where it is not given
     examined : result of `bridge_jumps` for the log with this configuration
     """
-    config = Config() if config is None else config
+    config = with_convergence(log, Config() if config is None else config, [])
     frozen = frozen_stretches(log, config)
     unfrozen = log_without(log, frozen)
     known: dict[Check, Check] = {

@@ -19,14 +19,16 @@ from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import downwards
 from rovgraph.log.streams import integral
-from rovgraph.log.units import turn_angles
+from rovgraph.log.units import UNITS, turn_angles
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import DESCENT, FOLLOWS, TURNING, MotionLimits, remedy_of_lag
 from rovgraph.sensors.dvl import other_way_up
+from rovgraph.sensors.pressure import BY_PRESSURE, density
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
+SAME_UNIT = 0.1  # logarithm of a ratio within which two units are one
 LEAST_STEP = 0.3  # of a depth whose zero is set again [m]
 STEPS = 10.0  # times its usual change against the DVL's way
 MOST_STEPS = 3
@@ -228,7 +230,8 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     down = downwards(log["imu"], config, pings.time)
     depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
-    if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
+    closely = abs(f.correlation) > CLOSELY
+    if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b if closely else 0.0) < ENOUGH_DIVING:
         yield Finding("dvl", "ok", "depth changes too little to compare the vertical velocity with it")
         return
     numbers = f"slope {f.slope:.2g}, correlation {f.correlation:.2f} over {f.windows} windows"
@@ -249,8 +252,10 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "if depth counts upwards, state units: {depth: -m}",
             "sign",
         )
+    elif closely and (meant := _other_units(f.slope, log, config)):
+        yield Finding("depth", "warning", f"the DVL sinks {f.slope:.3g} times as far: {meant} ({numbers})", "unit")
     else:
-        low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
+        low, high = (0.7, 1.4) if closely else (0.4, 2.5)  # few pings a wave lower the slope
         if low < f.slope < high:
             yield Finding("dvl", "ok", f"vertical velocity agrees with the change of depth ({numbers})")
         else:
@@ -260,6 +265,31 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     behind = Lag(-found.seconds, found.sd, found.evidence)
     against, believed = "the change of depth", believed_lag(config, "dvl", than="depth")
     yield from _clock("dvl", "vertical velocity", against, behind, DESCENT, believed, "check the clocks of both")
+
+
+def _other_units(slope: float, log: Log, config: Config) -> str:
+    """Units in which numbers of a depth or a pressure sink as the DVL does, and what to state; "" = none or as read.
+
+    Parameters
+    ----------
+    slope : the DVL's way down for a metre of depth
+    """
+
+    def fitting(quantity: str, column: str, own: float) -> list[str]:
+        units, read_in = UNITS[quantity], config.units.get(column, "").removeprefix("-")
+        true = slope * units.get(read_in, 1.0) / own
+        return [unit for unit, factor in units.items() if abs(np.log(factor / true)) < SAME_UNIT]
+
+    if abs(np.log(slope)) < SAME_UNIT:
+        return ""
+    if any(note.startswith(BY_PRESSURE) for note in log.notes):
+        units = fitting("pressure", "pressure", 1.0)
+        return f"if it is in {units[-1]}, state units: {{pressure: {units[-1]}}}" if units else ""
+    metres = fitting("length", "depth", 1.0)
+    pressures = fitting("pressure", "depth", 1.0 / (density(config) * config.environment.gravity))
+    said = [f"if it is in {unit}, state units: {{depth: {unit}}}" for unit in metres[-1:]]
+    said += [f"if it is a pressure in {u}, name it pressure and state units: {{pressure: {u}}}" for u in pressures[-1:]]
+    return "; ".join(said)
 
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:

@@ -30,10 +30,13 @@ from rovgraph.diagnosis.check.inertial import (
 from rovgraph.diagnosis.check.lags import MIN_WINDOWS, ORIENTATIONS, Signal, fit
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.geometry import Array, cross, rotate, skew
+from rovgraph.inference.initialise import dip_of_log, field_by_place
 from rovgraph.log import Log, Stream
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.rules import CLIPPED, FOLLOWS
+from rovgraph.sensors.compass import declination
 from rovgraph.sensors.instruments import OFFSETS, heading_sources
+from rovgraph.sensors.magnetometer import EARTH_FIELD
 
 COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading themselves
 FOLLOWS_GYRO = 10.0  # before and after, over which a magnetometer's heading is averaged against the gyro's [s]
@@ -46,6 +49,8 @@ SIMILAR = 1.3  # times the least square, up to which two rotations are not disti
 EVIDENCE = 60.0  # in chi-square
 LEVEL = 0.1  # of the field along the vertical, whose sense shows nothing
 UPSIDE_DOWN = 0.5  # of the field along the vertical in the wrong sense, which no iron makes
+MAGNITUDE, DIP_DEG = 0.2, 8.0  # of the Earth's field, more than what a usable magnetometer is off
+NORMALISED = 0.7, 1.4  # magnitudes of a field without a unit
 TROPIC_DEG = 20.0  # of latitude, beyond which the dip has its sign
 SAME_HEADING = np.deg2rad(40.0)  # of two compasses, which no offset and no iron exceeds
 
@@ -69,6 +74,34 @@ def compass_heading(log: Log, config: Config, sensor: str) -> Array:
     return np.asarray(np.unwrap(log[sensor].data[:, 0]) - np.arctan2(axis[1], axis[0]))
 
 
+def field_of_place(log: Log, config: Config) -> Iterator[Finding]:
+    """Magnitude and dip of the measured field against those of the place and the date."""
+    field = field_by_place(log) if "mag" in log else None
+    if field is None:
+        return
+    middle, total = float(np.median(np.linalg.norm(log["mag"].data, axis=1))), 1e-3 * field.total_nt
+    stated = any(name.startswith("mag") for name in config.units)
+    if not middle > 0.0 or (not stated and NORMALISED[0] < middle < NORMALISED[1]):
+        return
+    in_unit = [middle] if stated else [middle / size * EARTH_FIELD["uT"] for u, size in EARTH_FIELD.items() if u != "1"]
+    seen, wrong = min(in_unit, key=lambda size: abs(np.log(size / total))), []
+    if not stated and abs(np.log(seen / total)) > np.log(2.0):
+        return  # its unit is not known, which is told already
+    said = f"magnitude {seen:.1f} uT where the field is {total:.1f} uT there"
+    if abs(seen / total - 1.0) > MAGNITUDE:
+        wrong.append(said)
+    if "imu" in log and len(log["imu"]) > 1:
+        dip = dip_of_log(log)
+        said += f", dip {dip:.1f} deg where it is {field.dip_deg:.1f}"
+        if abs(dip - field.dip_deg) > DIP_DEG:
+            wrong.append(f"dip {dip:.0f} deg where the field's is {field.dip_deg:.0f} deg there")
+    if wrong:
+        cause = "hard or soft iron, or the scale: calibrate it (rovgraph calibrate magnetometer)"
+        yield Finding("mag", "warning", f"{' and '.join(wrong)}, by WMM2025: {cause}", "iron")
+    else:
+        yield Finding("mag", "ok", f"{said}, by WMM2025")
+
+
 def body_heading(log: Log, config: Config) -> tuple[str, Array, Array] | None:
     """The compass that gives the body's true heading best, its times and headings without jumps [rad].
 
@@ -85,7 +118,7 @@ def body_heading(log: Log, config: Config) -> tuple[str, Array, Array] | None:
             found = _by_field(log, config)
         if found is not None:
             offset = float(beliefs(config)[OFFSETS[sensor]].mean[0])
-            return sensor, found[0], found[1] - offset + np.deg2rad(config.environment.declination_deg)
+            return sensor, found[0], found[1] - offset + declination(config, sensor)
     return None
 
 

@@ -24,12 +24,15 @@ from numpy.typing import NDArray
 from rovgraph.diagnosis.check.compasses import body_heading
 from rovgraph.diagnosis.check.findings import Finding, believed_lag, since, valid_pings
 from rovgraph.diagnosis.check.inertial import in_gap
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log, Stream
 from rovgraph.log.streams import LAT_LON, integral
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.model.gauss_markov import walked
+from rovgraph.model.grids import convergence_and_scale, utm_zone
 from rovgraph.rules import BELIEVED_SDS, CLIPPED, START_REMEDY, SURE, TRACK, remedy_of_lag
+from rovgraph.sensors.compass import reference
 from rovgraph.sensors.dvl import other_way_up
 from rovgraph.sensors.instruments import DEFAULT_DIP, OFFSETS, heading_sources
 
@@ -172,6 +175,8 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "warning", text, "contradiction")
     else:
         turned = _turned(config, {sensor, *heading_sources(config, log.sensors)}, as_is, unlike)
+        said, sure = _of_grid(log, config, sensor, as_is)
+        turned = replace(turned, level="warning" if sure else turned.level, text=turned.text + said)
         stretched = turned.level != "ok" and abs(np.log(abs(as_is.c))) > STRETCHED
         apart = not plane.explained(as_is) and (stretched or as_is.agreement < LIKE)
         yield _contradicted(as_is) if apart else turned
@@ -204,6 +209,37 @@ def heading_believed(config: Config, compasses: Collection[str]) -> float:
         dip = DEFAULT_DIP if config.environment.dip_deg is None else np.deg2rad(config.environment.dip_deg)
         sds.append(priors["hard_iron"].sd / max(np.cos(dip), 0.1))
     return BELIEVED_SDS * math.hypot(*sds)
+
+
+def _of_grid(log: Log, config: Config, sensor: str, line: _Line) -> tuple[str, bool]:
+    """What says that a heading is relative to a grid, or was made true twice, by the turn of its track; "" = nothing.
+
+    With it, whether the compass is known so well that nothing else turns the track.
+    """
+    if log.origin is None or sensor not in NORTHS:
+        return "", False
+    grid = config.environment.grid or utm_zone(*log.origin)
+    try:
+        found = float(convergence_and_scale(grid, *np.array(log.origin))[0])
+    except InputError:  # no PROJ, or no such place
+        return "", False
+    turn, north = math.degrees(float(np.angle(line.c))), reference(config, sensor)
+    expected, sd = -found if north == "grid" else found, math.degrees(line.sd)
+    if abs(found) < OF_GRID_SDS * sd or abs(turn - expected) > max(0.25 * abs(found), OF_GRID_DEG):
+        return "", False
+    key = f"heading.{NORTHS[sensor]}_reference"
+    said = f"; the convergence of {grid} is {found:+.2f} deg there"
+    if north == "grid":
+        said += f", and was probably taken twice: if {sensor} is true already, state {key}: true"
+    else:
+        said += f": if {sensor} is relative to grid north, state {key}: grid, and environment.grid: {grid}"
+    prior = beliefs(config)[OFFSETS[sensor]]
+    offset = math.degrees(prior.sd) if prior.estimate or prior.considered else 0.0
+    return said, abs(found) > OF_GRID_SDS * offset
+
+
+NORTHS = {"ahrs": "ahrs", "dvl_heading": "dvl", "vehicle_heading": "vehicle"}
+OF_GRID_SDS, OF_GRID_DEG = 3.0, 0.2  # of a turn that is a convergence: beyond its sd, and from it
 
 
 def _contradicted(as_is: _Line) -> Finding:

@@ -7,14 +7,14 @@ and reports errors in them. docs/online-sources.md is the contract.
 
 import math
 import re
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from rovgraph.errors import InputError, kind_of
+from rovgraph.errors import InputError, kind_of, warn
 from rovgraph.live.sources import doppler
 from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6, tracker
 from rovgraph.live.sources.json_lines import json_lines
@@ -148,8 +148,7 @@ def one_of(*known: str) -> Callable[[str], str]:
 FASTEST_HZ = 50.0  # of polling
 MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
-Known = MutableMapping[str, float]  # values that a source has found and a resumed run needs
-Opener = Callable[[SourceUrl, Notify, Config, float, Known], Source]
+Opener = Callable[[SourceUrl, Notify, Config, float], Source]
 FORMS = {
     "-": "-",
     "tcp": "tcp://host:port",
@@ -173,7 +172,6 @@ def open_sources(
     warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
-    known: Known | None = None,
 ) -> tuple[Source, ...]:
     """Sources of URLs; see `open_source`.
 
@@ -189,7 +187,7 @@ def open_sources(
         if urls.count(url) > 1:
             raise InputError(f"{url}: given twice; each source can be read once")
     warnings = warnings or Warnings()
-    opened = tuple(open_source(url, warnings, config, speed, known) for url in urls)
+    opened = tuple(open_source(url, warnings, config, speed) for url in urls)
     logs = [source for source in opened if isinstance(source, LogReplay)]
     refuse_other_epochs(logs)
     begin = min((log.span[0] for log in logs), default=None)
@@ -201,7 +199,6 @@ def open_source(
     warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
-    known: Known | None = None,
 ) -> Source:
     """The source of a URL; docs/online-sources.md lists them.
 
@@ -211,7 +208,6 @@ def open_source(
     warnings : where those of the source go
     config : for columns, units, declination and gravity
     speed : of files, a number or "max"; their option ``speed`` goes before it
-    known : what sources have found out, such as the pressure at the surface; they add to it
 
     Raises
     ------
@@ -224,7 +220,7 @@ def open_source(
     if opener is None:
         raise _unknown(address)
     notify = partial((warnings or Warnings()).complain, url)
-    return opener(address, notify, config or Config(), pace_of(speed), {} if known is None else known)
+    return opener(address, notify, config or Config(), pace_of(speed))
 
 
 def pace_of(speed: str) -> float:
@@ -265,23 +261,23 @@ def _unknown(address: SourceUrl) -> InputError:
     return InputError(f"{address.url}: unknown kind of source; did you mean {meant}? {known}")
 
 
-def _standard_input(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _standard_input(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     address.take({})
     return LinkSource(address.url, StandardInput(), json_lines(address.url, notify, config))
 
 
-def _network(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _network(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     address.take({})
     return _networked(address, notify, json_lines(address.url, notify, config), end=b"\n")
 
 
-def _waterlinked(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _waterlinked(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     address.take({})
     link = TcpLink(*address.host_port(default_port=doppler.PORT), notify)
     return LinkSource(address.url, link, doppler.waterlinked(address.url, notify))
 
 
-def _ugps(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _ugps(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     inner = address.inner()
     if inner.scheme != "http":
         raise InputError(f"{address.url}: expected {FORMS['ugps']}, such as ugps:http://192.168.2.94")
@@ -293,7 +289,7 @@ def _ugps(address: SourceUrl, notify: Notify, config: Config, pace: float, known
 def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener:
     """Opener of a Doppler instrument at a TCP or UDP port, or a serial one."""
 
-    def opener(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+    def opener(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
         inner, decoder = address.inner(), make(address.url, notify)
         if inner.scheme in ("tcp", "udp"):
             address.take({})
@@ -307,12 +303,12 @@ def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener
     return opener
 
 
-def _file(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _file(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     pace = address.take({"speed": _pace}).get("speed", pace)
     return log_replay(address.url, address.place.removeprefix("//"), config, pace)
 
 
-def _nmea(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _nmea(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     inner = address.inner()
     if inner.scheme in ("tcp", "udp"):
         address.take({})
@@ -326,7 +322,7 @@ def _nmea(address: SourceUrl, notify: Notify, config: Config, pace: float, known
     return LinkSource(address.url, FileLink(path), nmea(address.url, notify, config, recorded=True), pace=pace)
 
 
-def _mavlink(address: SourceUrl, notify: Notify, config: Config, pace: float, known: Known) -> Source:
+def _mavlink(address: SourceUrl, notify: Notify, config: Config, pace: float) -> Source:
     inner = address.inner()
     recorded = address.place.lower().endswith((".tlog", ".tlog.gz"))
     serial = _is_device(address.place)
@@ -338,8 +334,9 @@ def _mavlink(address: SourceUrl, notify: Notify, config: Config, pace: float, kn
     options = address.take(
         _MAVLINK_OPTIONS | ({"speed": _pace} if recorded else {}) | ({"baud": _baud} if serial else {})
     )
+    options = {name: value for name, value in options.items() if name not in DEPTH_OPTIONS}
     pace, baud = options.pop("speed", pace), options.pop("baud", MAVLINK_BAUD)
-    decoder = MavlinkDecoder(address.url, notify, config, MavlinkOptions(**options), known)
+    decoder = MavlinkDecoder(address.url, notify, config, MavlinkOptions(**options))
     if recorded:
         return LinkSource(address.url, TelemetryReplay(_existing(address)), decoder, pace=pace)
     if serial:
@@ -348,13 +345,35 @@ def _mavlink(address: SourceUrl, notify: Notify, config: Config, pace: float, kn
     return _networked(inner, notify, decoder)
 
 
+DEPTH_OPTIONS = {"surface": "surface_hpa", "density": "density_kgm3"}  # that have become keys of ``depth``
+
+
+def with_depth_options(urls: Sequence[str], config: Config) -> Config:
+    """A configuration with what options of mavlink URLs state of surface and water, as they did before it had keys.
+
+    Raises
+    ------
+    InputError : no such surface or density
+
+    Warns
+    -----
+    DataWarning : the key that takes the option's place
+    """
+    for url in urls:
+        address = parse_address(url)
+        for name in DEPTH_OPTIONS.keys() & address.options.keys() if address.scheme == "mavlink" else ():
+            (value,) = replace(address, options={name: address.options[name]}).take({name: positive}).values()
+            config = config.changed(depth={DEPTH_OPTIONS[name]: value})
+            warn(f"{url}: option {name} will go; state depth: {{{DEPTH_OPTIONS[name]}: {value:g}}} instead")
+    return config
+
+
 _MAVLINK_OPTIONS = {
     "system": whole(1, 255),
     "component": whole(1, 255),
     "imu": one_of(*IMUS),
     "pressure": whole(1, 3),
-    "surface": positive,
-    "density": positive,
+    **dict.fromkeys(DEPTH_OPTIONS, positive),
 }
 
 

@@ -17,9 +17,10 @@ from rovgraph.live.sources.doppler import report_message
 from rovgraph.live.sources.source import LineDecoder, Notify
 from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
+from rovgraph.log.streams import LAT_LON, OF_GRID, SHIP_LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
 from rovgraph.log.units import Scale, near_miss, scales, turn_angles
 from rovgraph.model.config import Config
+from rovgraph.model.grids import lat_lon_of_grid
 from rovgraph.readers.records import Refused, json_number, json_object, shown
 from rovgraph.readers.waterlinked import is_report
 from rovgraph.sensors import SENSORS
@@ -64,7 +65,7 @@ class JsonRow:
         self._notify = notify
         self._names = {theirs: ours for ours, theirs in config.columns.items()}
         self._scale = scales(config.units, url)
-        self._angles, self._rules = config.angles, config.times.rules
+        self._angles, self._rules, self._grid = config.angles, config.times.rules, config.environment.grid
         turn_angles({}, config.angles, url)  # an unknown one is reported before the first line
         self._labels = labels()
         self._unknown: set[str] = set()
@@ -110,7 +111,25 @@ class JsonRow:
                 if not math.isfinite(cells[name]):  # a placeholder
                     del cells[name]
         turn_angles(cells, self._angles, self._url)
+        for lat_lon, of_grid in OF_GRID.items():
+            if {*of_grid} <= cells.keys():
+                cells |= dict(zip(lat_lon, self._on_ellipsoid(*(cells.pop(name) for name in of_grid)), strict=True))
         return cells
+
+    def _on_ellipsoid(self, northing: float, easting: float) -> tuple[float, float]:
+        """Latitude and longitude [deg] of a place of the map grid.
+
+        Raises
+        ------
+        Refused : the grid is not stated, or has no such place
+        """
+        if self._grid is None:
+            raise Refused("no grid", "a place of a map grid is left out; state environment.grid, such as EPSG:32632")
+        try:
+            lat, lon = lat_lon_of_grid(self._grid, np.array([easting]), np.array([northing]))
+        except InputError as error:
+            raise Refused("no grid", f"{error}; the line is skipped") from None
+        return float(lat[0]), float(lon[0])
 
     def _seconds(self, text: str) -> float:
         """Unix time of a date.

@@ -1,6 +1,6 @@
 """MAVLink, live: an autopilot's sensors; `rovgraph.readers.mavlink` reads the messages."""
 
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,10 @@ from rovgraph.geometry import wrap_angle
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources.source import Chunk, Notify, Preferred
 from rovgraph.model.config import Config
-from rovgraph.readers.ardupilot import density_of, depth, surface_of
+from rovgraph.readers.ardupilot import water_settings
 from rovgraph.readers.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, MavlinkFrames, dialect, usec
 from rovgraph.readers.recording import too_slow
+from rovgraph.sensors.compass import TRUE_NORTH, declination, turns_true_headings
 
 VEHICLE_COMPONENT = 1
 ENOUGH = 20  # samples of an IMU that give its rate
@@ -27,16 +28,12 @@ class MavlinkOptions:
     system, component : whose messages are read; system None = the first one heard
     imu : one of `IMUS`, None = the best one heard
     pressure : 1 to 3, the sensor of SCALED_PRESSURE, SCALED_PRESSURE2, SCALED_PRESSURE3
-    surface : pressure at depth 0 [hPa], None = as the autopilot states it, or the first one heard
-    density : of the water [kg/m3], None = as the autopilot states it, or fresh
     """
 
     system: int | None = None
     component: int = VEHICLE_COMPONENT
     imu: str | None = None
     pressure: int = 2
-    surface: float | None = None
-    density: float | None = None
 
 
 class MavlinkDecoder:
@@ -46,32 +43,23 @@ class MavlinkDecoder:
     ----------
     url : of the source
     notify : takes warnings
-    config : for the declination
+    config : for the declination, and what it states of surface and water
     options : of the URL
-    known : source and quantity -> what a run that is resumed has found out: the pressure at the surface
 
     Raises
     ------
     InputError : pymavlink is not installed
     """
 
-    def __init__(
-        self,
-        url: str,
-        notify: Notify,
-        config: Config,
-        options: MavlinkOptions,
-        known: MutableMapping[str, float] | None = None,
-    ) -> None:
+    def __init__(self, url: str, notify: Notify, config: Config, options: MavlinkOptions) -> None:
         self._url = url
         self._notify = notify
         self._options = options
         self._frames = MavlinkFrames(dialect(), notify)
         self._system = options.system
-        self._known: MutableMapping[str, float] = {} if known is None else known
-        self._parameters: dict[str, float] = {}
+        self._depth = config.depth
         self._samples: list[float] = []  # when the first ones were made [s]
-        self._declination = np.deg2rad(config.environment.declination_deg)
+        self._declination, self._turns = declination(config, "ahrs"), turns_true_headings(config)
         self._imus = Preferred(IMUS if options.imu is None else (options.imu,), notify)
         self._fix_time: int | None = None
         self._read: dict[str, Callable[[Any, float], Message | None]] = {
@@ -132,29 +120,26 @@ class MavlinkDecoder:
         return self._said_usec(arrival, usec(message), *found)
 
     def _attitude(self, message: Any, arrival: float) -> Message | None:
+        if not self._turns:
+            self._notify("true north", f"ATTITUDE is left out: {TRUE_NORTH}", once=True)
+            return None
         yaw, roll, pitch = READERS["ATTITUDE"](message)[0].values
-        magnetic = float(wrap_angle(yaw - self._declination))  # from true to magnetic north, as a compass has it
-        return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([magnetic, roll, pitch])))
+        heading = float(wrap_angle(yaw - self._declination))  # from true north to that of the log
+        return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([heading, roll, pitch])))
 
     def _parameter(self, message: Any, arrival: float) -> None:
-        """Of the autopilot, which sends them on request."""
+        """Of the autopilot, which sends them on request: what it states of surface and water is told, not used."""
         name = message.param_id
-        self._parameters[name.rstrip("\0") if isinstance(name, str) else name.decode("ascii", "replace")] = float(
-            message.param_value
-        )
+        name = name.rstrip("\0") if isinstance(name, str) else name.decode("ascii", "replace")
+        stated, _ = water_settings(self._options.pressure - 1, {name: float(message.param_value)})
+        for key, value in stated.items():
+            if getattr(self._depth, key) is None:
+                said = f"the autopilot states {name}; if that is right, state depth: {{{key}: {value:g}}}"
+                self._notify(f"not stated: {key}", said, once=True)
 
     def _pressure(self, message: Any, arrival: float) -> Message | None:
-        pascal, key = np.array([100.0 * message.press_abs]), f"{self._url}: surface [Pa]"
-        parameters, stated = self._parameters, self._options.surface
-        if stated is not None:
-            self._known[key] = 100.0 * stated
-        elif key not in self._known and np.isfinite(pascal[0]):
-            surface, said, _ = surface_of(self._options.pressure - 1, pascal, parameters)
-            self._known[key] = surface
-            self._notify("surface", f"{surface / 100.0:.1f} hPa is taken as the pressure at the surface ({said})")
-        density = density_of(parameters) if self._options.density is None else self._options.density
-        below = float(depth(pascal, self._known.get(key, np.nan), density)[0])
-        return self._said_usec(arrival, usec(message), Reading("depth", np.array([below])))
+        found = READERS["SCALED_PRESSURE"](message)
+        return self._said_usec(arrival, usec(message), Reading("pressure", np.array(found[0].values)))
 
     def _fix(self, message: Any, arrival: float) -> Message | None:
         found = READERS["GPS_RAW_INT"](message)
@@ -173,7 +158,7 @@ class MavlinkDecoder:
         return self._said_usec(arrival, usec(message), found, sender=sender)
 
 
-_REQUIRED = {"imu": 6, "mag": 3, "ahrs": 3, "dvl": 4, "depth": 1, GEODETIC: 2}
+_REQUIRED = {"imu": 6, "mag": 3, "ahrs": 3, "dvl": 4, "pressure": 1, GEODETIC: 2}
 
 
 def _whole(reading: Reading) -> bool:

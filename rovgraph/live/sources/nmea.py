@@ -51,6 +51,7 @@ from rovgraph.readers.nmea_sentences import (
 )
 from rovgraph.readers.records import Refused
 from rovgraph.sensors import SENSORS
+from rovgraph.sensors.compass import TRUE_NORTH, declination, turns_true_headings
 
 RELATIVE = ("PSIMSSB", "USBLLONG", "USRTH", "USRTH true", "MicronNav", "SeaTrac")
 ON_EARTH = ("PTSAG", "PSONLLD", "PSONALL", "PSIMLBP")
@@ -78,7 +79,8 @@ class NmeaDecoder:
     def __init__(self, url: str, notify: Notify, config: Config, recorded: bool) -> None:
         self._url = url
         library()
-        self._declination = config.environment.declination_deg
+        self._declination, self._turns = math.degrees(declination(config, "ahrs")), turns_true_headings(config)
+        self._magnetic = config.environment.declination_deg - self._declination  # of a magnetic heading, for the log
         self._recorded = recorded
         self._times = SentenceTimes()
         self._notify = notify
@@ -252,11 +254,17 @@ class NmeaDecoder:
         return self._bare is not None and self._bare >= WITHOUT_CHECKSUM
 
     def _attitude(self, kind: str, angles: Sequence[float | None], arrival: float) -> Reading | None:
-        if not self._headings.takes(kind, arrival):
+        if (kind in TRUE and not self._can_turn(kind)) or not self._headings.takes(kind, arrival):
             return None
         heading, pitch, roll = np.deg2rad([np.nan if angle is None else angle for angle in angles])
-        heading -= np.deg2rad(self._declination) if kind in TRUE else 0.0
+        heading += np.deg2rad(-self._declination if kind in TRUE else self._magnetic)
         return Reading("ahrs", np.array([wrap_angle(heading), roll, pitch]))
+
+    def _can_turn(self, kind: str) -> bool:
+        """Whether a true heading can be given relative to the log's north."""
+        if not self._turns:
+            self._notify("true north", f"{kind} is left out: {TRUE_NORTH}", once=True)
+        return self._turns
 
     def _heading(self, sentence: Any, arrival: float) -> Reading | None:
         found = heading_of(sentence)
@@ -265,11 +273,10 @@ class NmeaDecoder:
         heading, true = found
         kind = sentence.sentence_type
         if kind == "HDG" and (variation := east(sentence.variation, sentence.var_dir)) is not None:
-            heading += variation - self._declination
-        elif true:
-            heading -= self._declination
-        if not self._headings.takes(kind, arrival):
+            heading, true = heading + variation, True
+        if (true and not self._can_turn(kind)) or not self._headings.takes(kind, arrival):
             return None
+        heading += -self._declination if true else self._magnetic
         return Reading("ahrs", np.array([wrap_angle(np.deg2rad(heading)), np.nan, np.nan]))
 
     def _fix(self, sentence: Any, arrival: float) -> Reading | None:

@@ -24,6 +24,7 @@ from rovgraph.log.tables import Table
 from rovgraph.log.units import UNITS, quantities
 from rovgraph.readers.guessing.names import Meaning, meaning
 from rovgraph.readers.inertial import GRAVITY, MOST
+from rovgraph.sensors.pressure import SAME_PA, units_of_air
 
 Sureness = Literal["sure", "likely", "unsure"]
 STEP_S = 0.0005, 0.5  # of an IMU's samples [s]: each lasts less than the factor between two units of time
@@ -180,6 +181,21 @@ def depths_by_size(depth: Array, stated: str) -> list[str]:
     return [unit for unit, factor in UNITS["length"].items() if most * factor <= DEEPEST]
 
 
+def pressures_by_air(pressure: Array, stated: str) -> UnitGuess:
+    """Unit of an absolute pressure, shape (n,), the least of which is the air's."""
+    factors = UNITS["pressure"]
+    least, most = (float(np.nanquantile(pressure, q)) for q in (0.01, 0.99))
+    of_air = units_of_air(least, factors)
+    unit = stated or (of_air[-1] if of_air else "Pa")
+    if (most - least) * factors[unit] < SAME_PA:
+        return UnitGuess(unit, "hardly changes: it may be of the air in a housing", "unsure")
+    if stated:
+        return UnitGuess(stated, "stated", "sure")
+    if not of_air:
+        return UnitGuess(unit, f"is at least {least:.4g}, and no air's in any unit: state it", "unsure")
+    return UnitGuess(unit, f"is at least {least:.4g}, the air's", "likely")
+
+
 def agreeing(slope: float, a: tuple[str, Sequence[str]], b: tuple[str, Sequence[str]]) -> list[tuple[str, str]]:
     """Pairs of units in which two sensors show the same.
 
@@ -238,6 +254,7 @@ VECTORS = {
     "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
     "dvl_altitude": ("dvl_altitude",),
     "depth": ("depth",),
+    "pressure": ("pressure",),
     "latitude": ("fix_lat", "fix_lon"),
     "north": ("fix_north", "fix_east"),
     "fix_sd": ("fix_sd",),

@@ -32,6 +32,7 @@ _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 _RATES = {"rate", "speed"}
 _SCALARS = {
     "depth": {"depth", "tiefe"},
+    "pressure": {"pressure", "press", "druck"},
     "dvl_altitude": {"altitude", "altimeter", "alt", "range", "height", "hoehe", "höhe"},
     "fix_lat": {"lat", "latitude", "breite", "breitengrad"},
     "fix_lon": {"lon", "lng", "longitude", "länge", "laenge", "längengrad"},
@@ -55,7 +56,6 @@ _DERIVED = {
                      "odometry"), "an estimate"),
     **dict.fromkeys(("delta", "increment", "error", "err"), "not a measurement that a log has"),
     **dict.fromkeys(("orientation", "quaternion", "quat", "q"), "a quaternion; write roll, pitch and yaw"),
-    **dict.fromkeys(("pressure", "press"), "a pressure; write the depth in metres"),
 }  # fmt: skip
 
 
@@ -139,7 +139,8 @@ def _assumption(field: str, words: set[str]) -> str:
     if field in ("fix_north", "fix_east") and not words & _FIX:
         return "taken for a position fix"
     if field in ("heading", "ahrs_yaw", "dvl_heading") and words & {"true", "hdt"}:
-        return "relative to true north by its name: set environment.declination_deg to 0"
+        compass = {"heading": "vehicle", "ahrs_yaw": "ahrs", "dvl_heading": "dvl"}[field]
+        return f"relative to true north by its name: state heading.{compass}_reference: true"
     return ""
 
 

@@ -270,6 +270,12 @@ def guess_others(groups: Mapping[str, Group], time: Array, out: Guesses) -> None
             if not group.stated:
                 unit = UnitGuess("m", "metres are assumed", "likely")
             propose(out, group, unit)
+    for group in _present(groups, "pressure"):
+        if "depth" in groups:
+            out.left |= {each.column: "a pressure beside a depth" for each in group.columns.values()}
+            continue
+        values = next(iter(group.columns.values())).values
+        propose(out, group, physics.pressures_by_air(values, group.stated))
     for group in _present(groups, "latitude"):
         fixes = group.signal(time, VECTORS["latitude"])
         unit = UnitGuess("deg", "no row is whole", "unsure")

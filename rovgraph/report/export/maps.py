@@ -19,6 +19,7 @@ import pandas as pd
 
 from rovgraph.errors import InputError, in_one_line, warn
 from rovgraph.geometry import Array
+from rovgraph.model.grids import convergence_and_scale, utm_zone
 from rovgraph.report.export.formats import ExportFormat, ExportOptions
 from rovgraph.report.export.track import SHOWN_HZ, Track, ellipse, point_table
 
@@ -222,6 +223,9 @@ def write_layer(track: Track, path: Path, options: ExportOptions, driver: str) -
     sampled = track.at_rate(options.rate_or(SHOWN_HZ))
     table = point_table(sampled)
     x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
+    if options.crs is not None:  # headings are relative to true north
+        north, scale = convergence_and_scale(crs, table["lat"].to_numpy(), table["lon"].to_numpy())
+        table = table.assign(grid_north=north.round(5), grid_scale=scale.round(8))
     points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(sampled.height)])))
     fields = [name[:LONGEST] if driver == "ESRI Shapefile" else name for name in table.columns]
     try:
@@ -262,7 +266,7 @@ def projected(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, st
     import pyproj
 
     if crs.lower() == "utm":
-        crs = f"EPSG:{326 if lat[0] >= 0 else 327}{int((lon[0] + 180.0) // 6.0) % 60 + 1:02d}"
+        crs = utm_zone(float(lat[0]), float(lon[0]))
     try:
         system = pyproj.CRS.from_user_input(crs)
         transform = pyproj.Transformer.from_crs(WGS84, crs, always_xy=True)
