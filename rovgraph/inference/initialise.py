@@ -327,8 +327,8 @@ def _positions(log: Log, config: Config) -> tuple[Stream | None, Sequence[float]
 
 def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
     """The first fix, shape (2,), and its sd [m]; the line through the first ones instead of one that is far off it."""
-    logged_sd = fixes["fix_sd"][0]
-    sd = float(logged_sd) if logged_sd > 0.0 else sd
+    logged = [float(fixes[name][0]) for name in ("fix_sd", "fix_east_sd") if name in fixes.columns]
+    sd = max((value for value in logged if value > 0.0), default=sd)
     line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
     off = float(np.linalg.norm(fixes.data[0, :2] - line))
     return (line if off > AGREE_SD * (sd + FIRST_FIX_SD) else fixes.data[0, :2]), sd

@@ -48,7 +48,7 @@ from rovgraph.log import Log, read_log
 from rovgraph.log.streams import RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
 
-VERSION = 8
+VERSION = 9
 NAME = b"rovgraph checkpoint"
 ARRAY = "$array"
 NUMBERS = "biufc"  # kinds of dtypes: boolean, integer, unsigned, float, complex
