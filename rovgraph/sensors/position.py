@@ -77,7 +77,7 @@ def positioning(config: Config, origin_b: Array) -> Instrument:
 
 def _noise_of_fix(values: Array, believed: Instrument, config: Config) -> Array:
     """Sds of north and of east, and their covariance, shape (3,); what is not known is the instrument's."""
-    return _noise_of_fixes(values[None], believed.sd[0])[0]
+    return np.asarray(_noise_of_fixes(values[None], believed.sd[0])[0])
 
 
 def _noise_of_fixes(values: Array, sd: float) -> Array:
