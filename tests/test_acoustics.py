@@ -5,6 +5,7 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from live import flown
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
+from rovgraph.inference import correlated_noise
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
 from rovgraph.live.intake import Intake
@@ -401,6 +403,30 @@ def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told(
     beacon = {e.label: e for e in filtered.estimates[0].calibration}
     assert filtered.estimates[0].kind == "filtered" and filtered.verdict == "doubtful"
     assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+
+
+@pytest.mark.slow
+def test_the_scales_of_dvl_and_ranges_do_not_grow_together_about_a_beacon_that_nobody_placed():
+    """A gyro's scale is off by 2.6 of its sds, which a DVL's error of 4 % and as much of the speed of sound fit better."""
+    dive = acoustics.one_beacon(6)
+    error, found = rms(campaign_log(dive), dive)
+    scale = next(e for e in found.estimates[0].calibration if e.label == "sound_speed_scale")
+    assert error < 2.0 and abs(scale.value) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("present", "settings", "hidden"),
+    [
+        (["dvl", "range"], "beacons: [{name: 1}]", True),
+        (["dvl", "range", "fix"], "beacons: [{name: 1}]", False),
+        (["dvl", "range"], "beacons: [{name: 1}, {name: 2, north_m: 0, east_m: 0}]", False),
+        (["dvl", "range"], "ship: {receivers: {0: [0, 0, 1]}}", False),
+        (["dvl", "depth"], "", False),
+    ],
+)
+def test_only_ranges_to_beacons_that_nobody_placed_hide_the_scale_of_the_dvl(present, settings, hidden):
+    chain = SimpleNamespace(blocks=dict.fromkeys(present), initial=SimpleNamespace(config=parse_config(settings)))
+    assert correlated_noise._hidden_by_ranges(chain) == (("dvl_error",) if hidden else ())
 
 
 def test_a_dive_with_a_usbl_alone_begins_where_it_puts_the_vehicle():
