@@ -407,7 +407,7 @@ def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told(
 
 @pytest.mark.slow
 def test_the_scales_of_dvl_and_ranges_do_not_grow_together_about_a_beacon_that_nobody_placed():
-    """A gyro's scale is off by 2.6 of its sds, which a DVL's error of 4 % and as much of the speed of sound fit better."""
+    """A gyro's scale is off by 2.6 of its sds; 4 % of the DVL and as much of the speed of sound fit better."""
     dive = acoustics.one_beacon(6)
     error, found = rms(campaign_log(dive), dive)
     scale = next(e for e in found.estimates[0].calibration if e.label == "sound_speed_scale")
@@ -420,7 +420,7 @@ def test_the_scales_of_dvl_and_ranges_do_not_grow_together_about_a_beacon_that_n
         (["dvl", "range"], "beacons: [{name: 1}]", True),
         (["dvl", "range", "fix"], "beacons: [{name: 1}]", False),
         (["dvl", "range"], "beacons: [{name: 1}, {name: 2, north_m: 0, east_m: 0}]", False),
-        (["dvl", "range"], "ship: {receivers: {0: [0, 0, 1]}}", False),
+        (["dvl", "range"], "ship: {receivers: {'0': [0, 0, 1]}}", False),
         (["dvl", "depth"], "", False),
     ],
 )
