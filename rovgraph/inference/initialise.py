@@ -154,6 +154,7 @@ QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that c
 STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
 HEADINGS = 50  # samples of a source that are looked at
 UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
+TWICE_SD = 3.0  # of the depth sensor's own error: its first value enters by itself, too
 FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
 AGREE_SD = 3.0  # of a fix with the line through those around it
 MOST_MPS = 1.0  # speed of a vehicle before its first position
@@ -304,9 +305,11 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
-        scale = beliefs(config)["depth_scale"]
-        if (scale.considered or scale.estimate) and start.down_sd_m is None:  # deep down it is more than the start's sd
-            sd[2] = max(sd[2], scale.sd * abs(float(p_n[2])))
+        believed, down = beliefs(config), abs(float(p_n[2]))
+        own = [believed[name] for name in ("depth_offset", "depth_scale")]
+        off = np.hypot(*[b.sd * size * (b.considered or b.estimate) for b, size in zip(own, (1.0, down), strict=True)])
+        if start.down_sd_m is None:
+            sd[2] = max(sd[2], TWICE_SD * float(off))
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
         sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
