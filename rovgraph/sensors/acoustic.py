@@ -117,6 +117,7 @@ def _is_range(values: Array) -> NDArray[np.bool_]:
 
 
 DEGREES = 0.1  # share of angles beyond a full circle, which only degrees have
+PLUMB, OFTEN = 1e-4, 0.2  # from 90 degrees [rad], in a share of replies that no vehicle below the head has
 LARGEST_TILT = 0.35  # rms of a ship's roll or pitch [rad]
 
 
@@ -136,6 +137,10 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
             f"its angles reach {largest:.4g} rad; if they are in degrees, state units: {{{key}: deg}}",
             "unit",
         )
+    plumb = int((np.abs(np.abs(values[:, 3]) - 0.5 * np.pi) < PLUMB).sum())
+    if plumb > max(OFTEN * len(values), 1):
+        text = f"its elevation is 90 degrees in {plumb} of {len(values)} replies, which stands for none"
+        yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
 
 
 def _look_at_heading(values: Array, config: Config) -> Iterator[Said]:
