@@ -26,7 +26,7 @@ from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.acoustics import Acoustics
 from rovgraph.problem.assembly import assembly_of
-from rovgraph.sensors import AcousticExchange
+from rovgraph.sensors import SENSORS, AcousticExchange
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.sound import SoundSpeedProfile, _read, profile_of
 
@@ -223,6 +223,22 @@ def test_a_range_without_a_name_to_an_unplaced_beacon_is_left_out_live():
     intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 4]
     assert intake.measurement(1.0, Reading("range", np.array(range_only))) is None
     assert "beacon wreck has no place" in intake.news[0][1]
+
+
+def test_elevations_that_stand_at_90_degrees_are_named():
+    values = reply(5.0, 150.0, 0.3, 0.8).data.repeat(50, axis=0)
+    assert not list(SENSORS["usbl"].look(values, Config()))
+    values[:11, 3] = 0.5 * np.pi
+    ((_, text, _),) = SENSORS["usbl"].look(values, Config())
+    assert text.startswith("its elevation is 90 degrees in 11 of 50 replies")
+
+
+def test_a_ship_on_a_grid_is_named_where_the_start_is_not():
+    ship = np.array([[5540000.0, 447995.0, np.nan]])
+    ((_, text, _),) = SENSORS["ship"].look(ship, parse_config("start: {north_m: 0, east_m: 0}"))
+    assert "eastings and northings of a grid" in text
+    for start in ("start: {}", "start: {north_m: 5540100, east_m: 448000}"):
+        assert not list(SENSORS["ship"].look(ship, parse_config(start)))
 
 
 def test_depth_that_is_given_is_not_used_again():

@@ -371,7 +371,7 @@ def _add_local_fixes(
         if all(name in cells for name in local):
             warn(f"{source}: {lat_lon[0]} and {lat_lon[1]} are ignored beside {local[0]} and {local[1]}")
             continue
-        lat, lon = valid_positions(cells.pop(lat_lon[0]), cells.pop(lat_lon[1]), line, source)
+        lat, lon = valid_positions(cells.pop(lat_lon[0]), cells.pop(lat_lon[1]), line, source, of)
         valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
         cells[local[0]], cells[local[1]] = lat * np.nan, lon * np.nan
         if not valid.size:

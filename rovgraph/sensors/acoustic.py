@@ -143,6 +143,19 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
         yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
 
 
+def _look_at_place(values: Array, config: Config) -> Iterator[Said]:
+    start = config.start
+    begin = np.array([start.north_m or 0.0, start.east_m or 0.0])
+    away = float(np.hypot(*(np.median(values[:, :2], axis=0) - begin)))
+    if start.located and away > FARTHEST_M:
+        yield (
+            "warning",
+            f"the ship is {away / 1e3:.0f} km from where the dive begins, start.north_m {begin[0]:g}, "
+            f"start.east_m {begin[1]:g}: if these are eastings and northings of a grid, state the start on it, or null",
+            "start",
+        )
+
+
 def _look_at_heading(values: Array, config: Config) -> Iterator[Said]:
     if in_degrees(values).any():
         text = f"it reaches {np.abs(values).max():.4g} rad; if it is in degrees, state units: {{ship_heading: deg}}"
@@ -200,6 +213,7 @@ SHIP = Sensor(
     ),
     may_begin_later=True,
     occasional=True,
+    look=_look_at_place,
 )
 SHIP_HEADING = Sensor(
     "ship_heading",
