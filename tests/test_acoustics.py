@@ -117,7 +117,7 @@ def acoustics_of(config: Config, **ship: float) -> Acoustics:
 
 
 def reply(time: float, length: float, bearing: float, elevation: float) -> Stream:
-    row = np.full((1, 10), np.nan)
+    row = np.full((1, 11), np.nan)
     row[0, [0, 2, 3]] = length, bearing, elevation
     return Stream("usbl", (), np.array([time]), row, np.array([2]))
 
@@ -177,7 +177,7 @@ def test_beyond_the_end_of_its_log_the_ship_goes_on_smoothly():
 
 
 def test_replies_without_a_length_are_left_out():
-    no_reply, soon = np.full((2, 1, 10), np.nan)
+    no_reply, soon = np.full((2, 1, 11), np.nan)
     no_reply[0, 4:7], soon[0, 1:4] = 0.0, (0.1, 0.3, 0.8)
     for row, config in ((no_reply, ""), (soon, "usbl: {turn_around_s: 0.3}")):
         left_out: Counter[tuple[str, str]] = Counter()
@@ -204,7 +204,7 @@ def test_receivers_at_a_jetty_are_paired_live_too(apart):
     found, made = Acoustics(config, {"range": instruments(config)["range"]}), []
     for t in range(5):
         for k in range(3):
-            values = np.array([15.0 + 0.1 * k, np.nan, np.nan, k, np.nan])
+            values = np.array([15.0 + 0.1 * k, np.nan, np.nan, k, np.nan, np.nan])
             made += found.insert(Measurement(t + apart * k, "range", values, 0), {"range": 0.0}, Counter())
     assert Counter(m.values[2 + at.WAYS] for m in made) == {0.0: 8, 1.0: 4}  # the last wait
 
@@ -220,7 +220,7 @@ def test_another_transponder_at_the_same_time_ends_no_dive():
 
 
 def test_a_range_without_a_name_to_an_unplaced_beacon_is_left_out_live():
-    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 4]
+    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 5]
     assert intake.measurement(1.0, Reading("range", np.array(range_only))) is None
     assert "beacon wreck has no place" in intake.news[0][1]
 
@@ -267,6 +267,19 @@ def test_rays_and_means_are_those_of_the_closed_form_in_a_constant_gradient(angl
     assert np.arccosh(1.0 + g**2 * (across**2 + down**2) / (2.0 * c1 * c2)) / abs(g) == pytest.approx(seconds, abs=2e-8)
     (mean,) = water.mean(np.array([begin]), np.array([begin + down]))
     assert mean == pytest.approx(g * down / np.log(c2 / c1), abs=1e-3)
+
+
+def test_a_speed_of_sound_of_each_measurement_takes_precedence():
+    raw = reply(5.0, np.nan, 0.3, 0.8)
+    row = np.repeat(raw.data, 3, axis=0)
+    row[:, 1], row[:, -1] = 0.05 + 0.1, [np.nan, 1450.0, 1550.0]
+    stream = replace(raw, time=5.0 + np.arange(3.0), data=row, row=np.arange(3))
+    made = acoustics_of(parse_config("usbl: {turn_around_s: 0.05}")).exchanges(stream, 0.0, Counter())
+    np.testing.assert_allclose(made.data[:, 0], [75.0, 72.5, 77.5])
+    row[:, -1] = [4900.0, 0.0, -1.0]  # the first in ft/s; those of 0 or less are not known
+    assert [bad.tolist() for why, bad in SENSORS["usbl"].refused(row, Config()) if why.startswith("a speed")] == [
+        [True, False, False]
+    ]
 
 
 def test_a_profile_is_read_from_rows_and_files_and_what_is_none_is_refused(tmp_path):

@@ -45,6 +45,7 @@ from typing import Literal
 from rovgraph.log.stamps import DAY_S
 from rovgraph.readers.nmea_sentences import has_checksum, number
 from rovgraph.readers.records import Refused, shown
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 HALF_HOUR_S = 1800.0
 FARTHEST_M = 20e3  # of a reply: farther, eastings and northings were taken for a relative position
@@ -531,7 +532,7 @@ def _seatrac(text: str) -> Told:
     if kind not in _FIXES:
         raise Refused("other", "no measurement that a log has")
     try:
-        _, beacon, flags, *_ = _HEAD.unpack_from(fix)
+        _, beacon, flags, *_, speed, _ = _HEAD.unpack_from(fix)
         at = _HEAD.size
         if flags & 3 != 3:
             raise Refused(NO_POSITION, "no range and direction")
@@ -549,6 +550,8 @@ def _seatrac(text: str) -> Told:
         "usbl_bearing": math.radians(0.1 * azimuth),
         "usbl_elevation": -math.radians(0.1 * elevation),
     }
+    if SLOWEST_MPS < 0.1 * speed < FASTEST_MPS:
+        columns["usbl_sound_speed"] = 0.1 * speed
     return Reply("SeaTrac", str(beacon), NOW, "transducer", columns)
 
 
