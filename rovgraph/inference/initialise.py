@@ -305,10 +305,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
-        believed, down = beliefs(config), abs(float(p_n[2]))
-        own = [believed[name] for name in ("depth_offset", "depth_scale")]
-        off = np.hypot(*[b.sd * size * (b.considered or b.estimate) for b, size in zip(own, (1.0, down), strict=True)])
         if start.down_sd_m is None:
+            sizes = (beliefs(config)["depth_offset"], 1.0), (beliefs(config)["depth_scale"], float(p_n[2]))
+            off = np.linalg.norm([b.sd * size for b, size in sizes if b.considered or b.estimate])
             sd[2] = max(sd[2], TWICE_SD * float(off))
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
