@@ -87,13 +87,15 @@ def interrupted(log: Log, begin: float, seconds: float, *sensors: str) -> Log:
 
 
 def level_log(seconds: float, acc: Array, gyr: Array, rate: float = 100.0, **sensors: tuple[Array, Array]) -> Log:
-    """A log of an IMU with constant signals, and other sensors as ``name=(time, data)``."""
+    """A log of an IMU with constant signals, and other sensors as ``name=(time, data)``; last columns may lack."""
     time = np.round(np.arange(int(seconds * rate) + 1) / rate, 4)
     data = np.tile(np.concatenate([acc, gyr]), (len(time), 1))
     streams = {"imu": Stream("imu", STREAMS["imu"], time, data, np.arange(len(time)) + 2)}
     for name, (at, values) in sensors.items():
         rows = np.arange(len(at)) + 10_000
-        streams[name] = Stream(name, STREAMS[name], np.asarray(at, float), np.asarray(values, float), rows)
+        data = np.full((len(at), len(STREAMS[name])), np.nan)
+        data[:, : np.shape(values)[1]] = values
+        streams[name] = Stream(name, STREAMS[name], np.asarray(at, float), data, rows)
     return Log("dive.csv", streams)
 
 

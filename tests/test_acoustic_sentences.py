@@ -80,7 +80,7 @@ def test_axes_of_a_reply(axes, frame, xy):
 def test_degrees_move_the_later_fields_by_two():
     found = told(sentence("PSIMSSB,120000.00,B01,A,,D,N,M,5030.0000,N,00130.0000,W,24.8,1.4,N,,"))
     assert isinstance(found, AcousticPosition)
-    assert (found.lat, found.lon, found.sd) == (50.5, -1.5, 1.4)
+    assert (found.lat, found.lon, found.noise[0]) == (50.5, -1.5, 1.4)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_real_positions_of_a_ranger(line, name, lat, lon, sd, ship):
     found = told(line)
     assert isinstance(found, AcousticPosition)
     assert (found.name, found.lat, found.lon, found.of_ship) == (name, lat, lon, ship)
-    assert found.sd == pytest.approx(sd)
+    assert found.noise[0] == pytest.approx(sd)
 
 
 def test_eastings_and_northings_need_the_ship():
@@ -207,7 +207,7 @@ def test_eastings_and_northings_need_the_ship():
     assert isinstance(ship, ShipAttitude) and ship.heading == math.pi
     found = told("$PSONALL,2401,Transducer,134446.178,650778.88,5688917.56,1000.09,,,G,,,,7.521,0.606*3F")
     assert isinstance(found, AcousticPosition)
-    assert (found.grid, found.sd) == ((650778.88, 5688917.56), 7.521)
+    assert (found.grid, found.noise[0]) == ((650778.88, 5688917.56), 7.521)
     near = on_ships_grid(found.grid, 51.33, -0.83)  # zone 30
     assert near is not None
     close(near, [51.3315406, -0.83563975], atol=2e-5)  # of its PSONLLD, minutes later
@@ -470,11 +470,15 @@ def test_a_gaps_gives_fixes_and_its_ship_unless_relative_positions_are_chosen(tm
 
 
 def test_positions_of_a_ranger_alone_are_fixes_by_the_time_of_day(tmp_path):
-    lines = [f"PSONLLD,1200{k:02d}.520,2401,A,51.3315406,-0.8356397,99.9,3.0,4.0,0.00,0.62,,,," for k in range(5)]
+    lines = [f"PSONLLD,1200{k:02d}.520,2401,A,51.3315406,-0.8356397,99.9,4.0,3.0,30.00,0.62,,,," for k in range(5)]
     recording = read(b"".join(sentence(line) for line in lines), tmp_path)
     fix = first(recording, "fix")
     close(fix.columns["time"], 43200.52 + np.arange(5))
-    close(fix.columns["fix_sd"], math.sqrt(12.5))
+    axes = np.array([[math.cos(np.pi / 6), -math.sin(np.pi / 6)], [math.sin(np.pi / 6), math.cos(np.pi / 6)]])
+    covariance = axes @ np.diag([16.0, 9.0]) @ axes.T
+    close(fix.columns["fix_sd"], math.sqrt(covariance[0, 0]))
+    close(fix.columns["fix_east_sd"], math.sqrt(covariance[1, 1]))
+    close(fix.columns["fix_cov_ne"], covariance[0, 1])
     assert [clock.unix_offset for clock in recording.clocks.values()] == [None]
 
 

@@ -5,6 +5,7 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from live import flown
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy
+from rovgraph.inference import correlated_noise
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
 from rovgraph.live.intake import Intake
@@ -24,7 +26,7 @@ from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.acoustics import Acoustics
 from rovgraph.problem.assembly import assembly_of
-from rovgraph.sensors import AcousticExchange
+from rovgraph.sensors import SENSORS, AcousticExchange
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.sound import SoundSpeedProfile, _read, profile_of
 
@@ -121,7 +123,7 @@ def acoustics_of(config: Config, **ship: float) -> Acoustics:
 
 
 def reply(time: float, length: float, bearing: float, elevation: float) -> Stream:
-    row = np.full((1, 10), np.nan)
+    row = np.full((1, 11), np.nan)
     row[0, [0, 2, 3]] = length, bearing, elevation
     return Stream("usbl", (), np.array([time]), row, np.array([2]))
 
@@ -181,7 +183,7 @@ def test_beyond_the_end_of_its_log_the_ship_goes_on_smoothly():
 
 
 def test_replies_without_a_length_are_left_out():
-    no_reply, soon = np.full((2, 1, 10), np.nan)
+    no_reply, soon = np.full((2, 1, 11), np.nan)
     no_reply[0, 4:7], soon[0, 1:4] = 0.0, (0.1, 0.3, 0.8)
     for row, config in ((no_reply, ""), (soon, "usbl: {turn_around_s: 0.3}")):
         left_out: Counter[tuple[str, str]] = Counter()
@@ -208,7 +210,7 @@ def test_receivers_at_a_jetty_are_paired_live_too(apart):
     found, made = Acoustics(config, {"range": instruments(config)["range"]}), []
     for t in range(5):
         for k in range(3):
-            values = np.array([15.0 + 0.1 * k, np.nan, np.nan, k, np.nan])
+            values = np.array([15.0 + 0.1 * k, np.nan, np.nan, k, np.nan, np.nan])
             made += found.insert(Measurement(t + apart * k, "range", values, 0), {"range": 0.0}, Counter())
     assert Counter(m.values[2 + at.WAYS] for m in made) == {0.0: 8, 1.0: 4}  # the last wait
 
@@ -224,9 +226,25 @@ def test_another_transponder_at_the_same_time_ends_no_dive():
 
 
 def test_a_range_without_a_name_to_an_unplaced_beacon_is_left_out_live():
-    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 4]
+    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 5]
     assert intake.measurement(1.0, Reading("range", np.array(range_only))) is None
     assert "beacon wreck has no place" in intake.news[0][1]
+
+
+def test_elevations_that_stand_at_90_degrees_are_named():
+    values = reply(5.0, 150.0, 0.3, 0.8).data.repeat(50, axis=0)
+    assert not list(SENSORS["usbl"].look(values, Config()))
+    values[:11, 3] = 0.5 * np.pi
+    ((_, text, _),) = SENSORS["usbl"].look(values, Config())
+    assert text.startswith("its elevation is 90 degrees in 11 of 50 replies")
+
+
+def test_a_ship_on_a_grid_is_named_where_the_start_is_not():
+    ship = np.array([[5540000.0, 447995.0, np.nan]])
+    ((_, text, _),) = SENSORS["ship"].look(ship, parse_config("start: {north_m: 0, east_m: 0}"))
+    assert "eastings and northings of a grid" in text
+    for start in ("start: {}", "start: {north_m: 5540100, east_m: 448000}"):
+        assert not list(SENSORS["ship"].look(ship, parse_config(start)))
 
 
 def test_depth_that_is_given_is_not_used_again():
@@ -255,6 +273,19 @@ def test_rays_and_means_are_those_of_the_closed_form_in_a_constant_gradient(angl
     assert np.arccosh(1.0 + g**2 * (across**2 + down**2) / (2.0 * c1 * c2)) / abs(g) == pytest.approx(seconds, abs=2e-8)
     (mean,) = water.mean(np.array([begin]), np.array([begin + down]))
     assert mean == pytest.approx(g * down / np.log(c2 / c1), abs=1e-3)
+
+
+def test_a_speed_of_sound_of_each_measurement_takes_precedence():
+    raw = reply(5.0, np.nan, 0.3, 0.8)
+    row = np.repeat(raw.data, 3, axis=0)
+    row[:, 1], row[:, -1] = 0.05 + 0.1, [np.nan, 1450.0, 1550.0]
+    stream = replace(raw, time=5.0 + np.arange(3.0), data=row, row=np.arange(3))
+    made = acoustics_of(parse_config("usbl: {turn_around_s: 0.05}")).exchanges(stream, 0.0, Counter())
+    np.testing.assert_allclose(made.data[:, 0], [75.0, 72.5, 77.5])
+    row[:, -1] = [4900.0, 0.0, -1.0]  # the first in ft/s; those of 0 or less are not known
+    assert [bad.tolist() for why, bad in SENSORS["usbl"].refused(row, Config()) if why.startswith("a speed")] == [
+        [True, False, False]
+    ]
 
 
 def test_a_profile_is_read_from_rows_and_files_and_what_is_none_is_refused(tmp_path):
@@ -407,6 +438,30 @@ def test_a_beacon_is_found_from_ranges_alone_and_on_one_leg_both_sides_are_told(
     beacon = {e.label: e for e in filtered.estimates[0].calibration}
     assert filtered.estimates[0].kind == "filtered" and filtered.verdict == "doubtful"
     assert np.hypot(beacon["beacon_1_north"].sd, beacon["beacon_1_east"].sd) > 100.0
+
+
+@pytest.mark.slow
+def test_the_scales_of_dvl_and_ranges_do_not_grow_together_about_a_beacon_that_nobody_placed():
+    """A gyro's scale is off by 2.6 of its sds; 4 % of the DVL and as much of the speed of sound fit better."""
+    dive = acoustics.one_beacon(6)
+    error, found = rms(campaign_log(dive), dive)
+    scale = next(e for e in found.estimates[0].calibration if e.label == "sound_speed_scale")
+    assert error < 2.0 and abs(scale.value) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("present", "settings", "hidden"),
+    [
+        (["dvl", "range"], "beacons: [{name: 1}]", True),
+        (["dvl", "range", "fix"], "beacons: [{name: 1}]", False),
+        (["dvl", "range"], "beacons: [{name: 1}, {name: 2, north_m: 0, east_m: 0}]", False),
+        (["dvl", "range"], "ship: {receivers: {'0': [0, 0, 1]}}", False),
+        (["dvl", "depth"], "", False),
+    ],
+)
+def test_only_ranges_to_beacons_that_nobody_placed_hide_the_scale_of_the_dvl(present, settings, hidden):
+    chain = SimpleNamespace(blocks=dict.fromkeys(present), initial=SimpleNamespace(config=parse_config(settings)))
+    assert correlated_noise._hidden_by_ranges(chain) == (("dvl_error",) if hidden else ())
 
 
 def test_a_dive_with_a_usbl_alone_begins_where_it_puts_the_vehicle():

@@ -222,6 +222,16 @@ def test_fixes_enter_every_one():
     np.testing.assert_array_equal(found(problem, "fix")[0].sd, [0.5, 0.5])  # its own fix_sd
 
 
+def test_an_ellipse_of_a_fix_is_its_noise_and_an_impossible_one_is_left_out():
+    noise = np.array([[0.5, 0.8, 0.3], [0.5, np.nan, -0.1], [0.5, 0.8, np.nan], [0.5, 0.8, -0.4]])
+    fixes = (np.array([0.6, 0.65, 0.7, 0.75]), np.column_stack([np.tile([1.0, 2.0], (4, 1)), noise]))
+    problem, left_out = assembled(log_of(2.0, [0.5, 0.9], fix=fixes))
+    taken = problem.noise(problem.of_sensor("fix"), 2)
+    np.testing.assert_array_equal(taken, [[0.5, 0.8, 0.3], [0.5, 0.5, -0.1], [0.5, 0.8, 0.0]])
+    ((sensor, why),) = left_out
+    assert sensor == "fix" and why.startswith("|fix_cov_ne| is not below fix_sd times fix_east_sd")
+
+
 def pings_with(values: dict[int, list[float]]) -> Log:
     """Ten pings, some of them with other values."""
     time = np.round(np.arange(10) * 0.2 + 0.1, 3)

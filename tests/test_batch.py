@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -25,6 +26,7 @@ from dives import (
 
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
+from rovgraph.geometry import matrix_from_rpy, rotate
 from rovgraph.inference import gauss_newton
 from rovgraph.inference.dead_reckoning import dead_reckon
 from rovgraph.inference.graph.batch import DiveGraph, indeterminate, make_graph, make_values, solve
@@ -77,6 +79,26 @@ def test_a_perfect_log_is_recovered(name):
     assert position_errors(estimate.trajectory, case).max() < 0.01
     assert np.linalg.norm(attitude_errors(estimate.trajectory, case), axis=1).max() < 0.01 * DEG
     assert estimate.summary["converged"]
+
+
+def test_fixes_with_ellipses_are_worth_more_than_with_the_sds_of_their_components():
+    """6 m along a direction that changes from fix to fix, 0.3 m across it."""
+    square = np.zeros(2)  # of the errors, with ellipses and without
+    for seed in range(3):
+        config, rng = falcon(start={"position_sd_m": 20.0}), np.random.default_rng(seed)
+        case = simulated(config, 120.0, seed=seed, fix_interval=10.0, imu_rate=50.0, dvl_rate=3.0)
+        fixes = case.log["fix"]
+        turn = rng.uniform(0.0, np.pi, len(fixes))
+        axes = matrix_from_rpy(np.column_stack([0.0 * turn, 0.0 * turn, turn]))[:, :2, :2]
+        S = axes @ np.diag([6.0**2, 0.3**2]) @ axes.transpose(0, 2, 1)
+        z = true_at(case, fixes.time).p_n[:, :2] + rotate(axes, rng.normal(0.0, [6.0, 0.3], (len(fixes), 2)))
+        for k, covariance in enumerate((S[:, 0, 1], np.nan * turn)):
+            data = np.column_stack([z, np.sqrt(S[:, 0, 0]), np.sqrt(S[:, 1, 1]), covariance])
+            log = replace(case.log, streams={**case.log.streams, "fix": replace(fixes, data=data)})
+            square[k] += np.mean(
+                position_errors(smooth(log, case.config, "smoothed").estimates[0].trajectory, case) ** 2
+            )
+    assert np.sqrt(square[0] / 3) < 0.2 and square[0] < 0.25 * square[1]
 
 
 def test_a_perfect_log_is_recovered_without_being_told_its_start():

@@ -97,8 +97,11 @@ def every_sensor() -> Case:
     ahrs, dvl, truth = log["ahrs"], log["dvl"], made.truth
     time = truth.time[(truth.time > 1.0) & (truth.time < 19.0)][:: len(truth.time) // 90]
     p_n = truth.p_n[truth.time.searchsorted(time)]
+    noise = np.array([0.5, 0.7, 0.3])  # of fixes: sds of north and east, covariance
+    L = np.linalg.cholesky([[noise[0] ** 2, noise[2]], [noise[2], noise[1] ** 2]])
+    fixes = np.column_stack([p_n[:, :2] + rng.standard_normal((len(time), 2)) @ L.T, np.tile(noise, (len(time), 1))])
     own = {
-        "fix": (time, p_n[:, :2] + 0.5 * rng.standard_normal((len(time), 2))),
+        "fix": (time, fixes),
         "vehicle_heading": (ahrs.time, ahrs.data[:, :1] + 0.03 * rng.standard_normal((len(ahrs.time), 1))),
         "dvl_water": (dvl.time, dvl.data[:, :3] + 0.03 * rng.standard_normal((len(dvl.time), 3))),
     }

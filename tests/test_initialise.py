@@ -337,14 +337,14 @@ def test_depth_of_the_start_is_the_first_sample_less_the_lever_arm():
 @pytest.mark.parametrize(
     ("depth", "yaml", "sd"),
     [
-        (3.0, "{}", 0.1),
-        (300.0, "{}", 4.5),  # 1.5 % by default
-        (300.0, "calibration: {depth_scale: {sd: 0.003}}", 0.9),
-        (300.0, "calibration: {depth_scale: {estimate: false}}", 0.1),
+        (0.0, "{}", 0.6),  # three times 0.2 m
+        (300.0, "{}", 3.0 * np.hypot(4.5, 0.2)),  # 1.5 % by default
+        (300.0, "calibration: {depth_scale: {sd: 0.003}, depth_offset: {estimate: false}}", 2.7),
+        (300.0, "calibration: {depth_scale: {estimate: false}, depth_offset: {estimate: false}}", 0.1),
         (300.0, "start: {down_sd_m: 0.3}", 0.3),
     ],
 )
-def test_a_deep_start_is_as_uncertain_as_the_sensors_scale(depth, yaml, sd):
+def test_a_start_by_the_depth_sensor_adds_nothing_to_what_it_measures(depth, yaml, sd):
     log = still(LEVEL, depth=(AT, np.full((20, 1), depth)))
     assert initialise(log, parse_config(yaml)).prior.p_sd[2] == pytest.approx(sd)
 

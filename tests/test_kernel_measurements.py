@@ -235,9 +235,12 @@ def test_chained_jacobian_is_the_product_with_that_of_the_propagation(name):
 @pytest.mark.parametrize("dim", [1, 2, 3, 4])
 def test_whitening_is_the_inverse_of_the_cholesky_factor(dim):
     gain, sd, rate_sd = RNG.standard_normal((dim, 3)), RNG.uniform(0.01, 1.0, (N, dim)), RNG.uniform(0.0, 1.0, N)
+    covariance = np.eye(dim) * sd[:, None] ** 2 + gain @ gain.T * rate_sd[:, None, None] ** 2
+    if dim == 2:  # the third is their covariance
+        sd = np.column_stack([sd, RNG.uniform(-0.99, 0.99, N) * sd.prod(axis=1)])
+        covariance[:, [0, 1], [1, 0]] += sd[:, 2:]
     W = np.full((N, dim, dim), np.nan)
     whiten_many(sd, gain @ gain.T, rate_sd, W)
-    covariance = np.eye(dim) * sd[:, None] ** 2 + gain @ gain.T * rate_sd[:, None, None] ** 2
     expected = np.linalg.inv(np.linalg.cholesky(covariance))
     np.testing.assert_allclose(W, expected, rtol=1e-10, atol=1e-12)
     np.testing.assert_array_equal(np.triu(W, 1), 0.0)

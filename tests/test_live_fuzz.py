@@ -111,7 +111,8 @@ def assert_sane(messages: list[Message]) -> None:
         assert message.stamp is None or math.isfinite(message.stamp)
         assert math.isfinite(message.arrival)
         for sensor, values in message.readings:
-            assert values.shape == ((3,) if sensor in ON_EARTH else (len(STREAMS[sensor]),))
+            assert sensor in ON_EARTH or values.shape == (len(STREAMS[sensor]),)
+            assert sensor not in ON_EARTH or 3 <= len(values) <= len(ON_EARTH[sensor])
             if sensor == "dvl" and values[3] == 0.0:
                 continue
             assert np.isfinite(values[: OPTIONAL.get(sensor)]).all()

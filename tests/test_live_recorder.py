@@ -69,13 +69,14 @@ def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
 def test_a_ping_without_bottom_lock_and_a_fix_in_degrees_come_back(tmp_path):
     recorder = Recorder(tmp_path / "r.csv")
     recorder.write(1.0, EPOCH, [Reading("dvl", np.array([np.nan, np.nan, np.nan, 0.0, np.nan]))])
-    recorder.write(2.0, EPOCH, [Reading(GEODETIC, np.array([58.3, 8.6, 1.5]))])
+    recorder.write(2.0, EPOCH, [Reading(GEODETIC, np.array([58.3, 8.6, 1.5, 2.5, -0.7]))])
     recorder.write(3.0, EPOCH, [Reading(GEODETIC, np.array([58.3001, 8.6, np.nan]))])
     recorder.close()
     log = read_quietly(tmp_path / "r.csv")
     assert log["dvl"]["dvl_valid"].tolist() == [0.0]
     assert log.origin == (58.3, 8.6)
-    np.testing.assert_allclose(log["fix"].data, [[0, 0, 1.5], [11.14, 0, np.nan]], atol=0.01)
+    of_unknown_noise = [11.14, 0, np.nan, np.nan, np.nan]
+    np.testing.assert_allclose(log["fix"].data, [[0, 0, 1.5, 2.5, -0.7], of_unknown_noise], atol=0.01)
 
 
 def test_the_arrival_is_the_last_column(tmp_path):
@@ -329,8 +330,8 @@ def test_no_checkpoint_and_one_of_another_version_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_checkpoint(tmp_path / "missing")
     write_checkpoint(tmp_path / "a", {})
-    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 8 ", b"checkpoint 3 "))
-    with pytest.raises(InputError, match="of version 3, expected 8"):
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 9 ", b"checkpoint 3 "))
+    with pytest.raises(InputError, match="of version 3, expected 9"):
         read_checkpoint(tmp_path / "a")
 
 

@@ -259,7 +259,7 @@ def test_a_line_says_what_the_row_of_a_log_would(heard):
     found = {r.sensor: r.values for r in message.readings}
     np.testing.assert_allclose(found["imu"], [1, 2, -9.8, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(found["depth"], [3.0])
-    np.testing.assert_allclose(found[GEODETIC], [1.0, 2.0, np.nan])
+    np.testing.assert_allclose(found[GEODETIC], [1.0, 2.0, np.nan, np.nan, np.nan])
     assert set(found) == {"imu", "depth", GEODETIC}
     assert heard.kinds == {"incomplete": 1}
 
@@ -888,11 +888,13 @@ def test_a_replay_says_everything_of_the_log_in_the_order_of_time(tmp_path):
 
 def test_fixes_in_degrees_are_replayed_in_degrees(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("time,fix_lat,fix_lon,fix_sd\n1,58.3,15.1,2\n2,58.31,15.2,\n")
+    path.write_text("time,fix_lat,fix_lon,fix_sd,fix_east_sd,fix_cov_ne\n1,58.3,15.1,2,3,-1.5\n2,58.31,15.2,,,\n")
     messages = list(open_source(f"file:{path}", speed="max").messages(threading.Event()))
     assert all(m.readings[0].sensor == GEODETIC for m in messages)
     np.testing.assert_allclose(
-        [m.readings[0].values for m in messages], [[58.3, 15.1, 2], [58.31, 15.2, np.nan]], atol=1e-9
+        [m.readings[0].values for m in messages],
+        [[58.3, 15.1, 2, 3, -1.5], [58.31, 15.2, np.nan, np.nan, np.nan]],
+        atol=1e-9,
     )
 
 
@@ -1109,7 +1111,7 @@ def test_thrusters_are_taken_from_the_first_on_without_a_hole(heard):
 @pytest.mark.parametrize("sd", [0, -1])
 def test_an_sd_of_0_or_less_is_not_known(sd, heard):
     (message,) = decoded(json_lines("-", heard, Config()), b'{"fix_north": 1, "fix_east": 2, "fix_sd": %d}\n' % sd)
-    np.testing.assert_array_equal(message.readings[0].values, [1.0, 2.0, np.nan])
+    np.testing.assert_array_equal(message.readings[0].values[:3], [1.0, 2.0, np.nan])
     assert not heard.kinds
 
 

@@ -230,6 +230,18 @@ def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
     np.testing.assert_allclose(np.cov((noise @ W.T).T), np.eye(3), atol=0.03)
 
 
+def test_two_components_are_weighed_by_their_covariance_too():
+    block, state = block_of("fix")
+    sd, covariance = block.problem.sd(block.index, 2), np.array([0.9, -0.5, 0.0, 0.3])
+    covariance *= sd.prod(axis=1)
+    block.problem.rows[:, at.SD + 2] = covariance
+    e = block.innovations(state)
+    for k in range(N):
+        S = np.diag(sd[k] ** 2) + covariance[k] * np.fliplr(np.eye(2))
+        assert np.sum(block.normalised(state)[k] ** 2) == pytest.approx(e[k] @ np.linalg.solve(S, e[k]))
+        np.testing.assert_allclose(np.linalg.inv(block.W[k].T @ block.W[k]), S, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_block_predicts_at_the_measurements_own_time(sensor):
     block, state = block_of(sensor)

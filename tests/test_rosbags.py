@@ -222,12 +222,14 @@ def test_a_bag_without_a_sensor_is_refused_by_its_topics(tmp_path):
 def test_fixes_are_those_of_a_receiver_that_has_one(tmp_path):
     def fix(k: int, status: int, kind: int = 2) -> Sent:
         fields = {"status": {"status": status, "service": 1}, "latitude": 50.0 + 1e-5 * k, "longitude": 8.0}
-        fields |= {"altitude": 0.0, "position_covariance": np.diag([4.0, 4.0, 9.0]).ravel()}
+        fields |= {"altitude": 0.0, "position_covariance": np.array([9.0, 2.0, 0.0, 2.0, 4.0, 0.0, 0.0, 0.0, 9.0])}
         return Sent(0.1 * k, "/fix", "sensor_msgs/msg/NavSatFix", fields | {"position_covariance_type": kind}, "gps")
 
     recording = read(tmp_path, imus(), [fix(0, 0), fix(1, -1), fix(2, 0), fix(3, 0, 0)])
     fixes = first(recording, "fix").columns
-    close(fixes["fix_sd"], [2.0, 2.0, np.nan])
+    close(fixes["fix_sd"], [2.0, 2.0, np.nan])  # its covariance counts from east
+    close(fixes["fix_east_sd"], [3.0, 3.0, np.nan])
+    close(fixes["fix_cov_ne"], [2.0, 2.0, np.nan])
     close(fixes["fix_lat"], 50.0 + 1e-5 * np.array([0, 2, 3]))
     assert left(recording) == {"/fix (sensor_msgs/msg/NavSatFix): no fix": 1}
 

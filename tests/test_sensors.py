@@ -276,12 +276,13 @@ def test_every_unit_has_the_factor_that_pint_has():
     inside = {
         "time": "second", "acceleration": "meter / second ** 2", "rate": "radian / second", "field": "microtesla",
         "angle": "radian", "speed": "meter / second", "length": "meter", "latitude": "degree", "pressure": "pascal",
+        "area": "meter ** 2",
     }  # fmt: skip
     named = {
         "g": "standard_gravity", "mg": "millistandard_gravity", "m/s2": "meter / second ** 2",
         "m/s^2": "meter / second ** 2", "mrad/s": "milliradian / second", "deg/s": "degree / second",
         "uT": "microtesla", "nT": "nanotesla", "mG": "milligauss", "gauss": "gauss", "us": "microsecond",
-        "degE7": "1e-7 degree",
+        "degE7": "1e-7 degree", "m2": "meter ** 2", "cm2": "centimeter ** 2", "mm2": "millimeter ** 2",
     }  # fmt: skip
     for kind, factors in UNITS.items():
         for unit, factor in factors.items():

@@ -190,7 +190,7 @@ def find_correlated_noise(
     """
     found: list[GaussMarkovError] = []
     rivals: list[Rival] = []
-    now, passed = _Baseline.of(best), {*without}
+    now, passed = _Baseline.of(best), {*without, *_hidden_by_ranges(best.chain)}
     while True:
         candidates = [_most_likely(now, probe) for probe in _probes(now, passed)]
         steps = _steps(now, passed)
@@ -208,6 +208,17 @@ def find_correlated_noise(
         found.append(error)
     beside = {error.variable for error in found}
     return found, [rival for rival in rivals if rival.error.variable not in beside]
+
+
+def _hidden_by_ranges(chain: Chain) -> tuple[str, ...]:
+    """The DVL's error of scale, where all else are ranges to beacons that nobody placed.
+
+    Such a beacon moves with the track, so the scales of the DVL and of the ranges (the speed of sound) are nearly one
+    sum: both grew together to 4 % where a gyro's scale was wrong.
+    """
+    config, present = chain.initial.config, chain.blocks.keys()
+    placed = config.ship.receivers or any(beacon.north_m is not None for beacon in config.beacons)
+    return ("dvl_error",) if "range" in present and not placed and not present & {"fix", "usbl"} else ()
 
 
 @dataclass(frozen=True)

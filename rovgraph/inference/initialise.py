@@ -174,6 +174,7 @@ QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that c
 STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
 HEADINGS = 50  # samples of a source that are looked at
 UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
+TWICE_SD = 3.0  # of the depth sensor's own error: its first value enters by itself, too
 FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
 AGREE_SD = 3.0  # of a fix with the line through those around it
 MOST_MPS = 1.0  # speed of a vehicle before its first position
@@ -313,9 +314,10 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
-        scale = beliefs(config)["depth_scale"]
-        if (scale.considered or scale.estimate) and start.down_sd_m is None:  # deep down it is more than the start's sd
-            sd[2] = max(sd[2], scale.sd * abs(float(p_n[2])))
+        if start.down_sd_m is None:
+            sizes = (beliefs(config)["depth_offset"], 1.0), (beliefs(config)["depth_scale"], float(p_n[2]))
+            off = np.linalg.norm([b.sd * size for b, size in sizes if b.considered or b.estimate])
+            sd[2] = max(sd[2], TWICE_SD * float(off))
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
         sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
@@ -336,8 +338,8 @@ def _positions(log: Log, config: Config) -> tuple[Stream | None, Sequence[float]
 
 def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
     """The first fix, shape (2,), and its sd [m]; the line through the first ones instead of one that is far off it."""
-    logged_sd = fixes["fix_sd"][0]
-    sd = float(logged_sd) if logged_sd > 0.0 else sd
+    logged = [float(fixes[name][0]) for name in ("fix_sd", "fix_east_sd") if name in fixes.columns]
+    sd = max((value for value in logged if value > 0.0), default=sd)
     line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
     off = float(np.linalg.norm(fixes.data[0, :2] - line))
     return (line if off > AGREE_SD * (sd + FIRST_FIX_SD) else fixes.data[0, :2]), sd

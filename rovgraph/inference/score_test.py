@@ -4,8 +4,9 @@ A constant that is held (the DVL's scale, the tilt of its mounting, the gyro's s
 together with what is estimated, in one Gauss-Newton step from the optimum: the Lagrange multiplier or score test
 (Rao 1948; Engle 1984). Where the configuration is right, the step over its sd is a standard normal number, so a step
 of many sds means that the constant has another value, which the step gives. Each is released by itself: two that affect
-the same measurements would hide each other. Spurious information of the DVL's arm is subtracted
-(`rovgraph.inference.lever_arm_bias`).
+the same measurements would hide each other. What is considered may be off by its prior's sd, which moves the step: its
+variance becomes P + P G D G' P, with G the information between what is released and what is considered, D the priors'
+variances. Spurious information of the DVL's arm is subtracted (`rovgraph.inference.lever_arm_bias`).
 """
 
 from collections.abc import Iterable
@@ -68,21 +69,27 @@ def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = N
     """
     used, beliefs = {*best.chain.blocks, "imu"}, dict(best.beliefs)
     held = [n for n in names if n not in best.unknowns.estimated and beliefs[n].is_shown_by(used)]
-    for name in held:
+    considered = [n for n in best.unknowns.considered if beliefs[n].is_shown_by(used)]
+    free = tuple(dict.fromkeys([*held, *considered]))
+    for name in free:
         belief = beliefs[name]
         beliefs[name] = replace(belief, estimate=True, sd=WIDE * belief.variable.sd, walk=0.0)
-    released = widened(best.chain, best.state, tuple(held), beliefs)
+    released = widened(best.chain, best.state, free, beliefs)
     root = released.eliminate(best.state, best.solution.gates if gates is None else gates, kept=1)
     R, z = root.border[:, :-1], root.border[:, -1]
     information, score = R.T @ R, R.T @ z
     kept = [released.layout.places[name] for name in best.unknowns.estimated]
     always = np.concatenate([np.empty(0, np.int64), *(np.r_[part] for border, part in kept if border)])
+    prior = {c: best.beliefs[name].sd for name in considered for c in np.r_[released.layout.places[name][1]].tolist()}
     out = []
     for name in held:
         for label, component in zip(beliefs[name].variable.labels, np.r_[released.layout.places[name][1]], strict=True):
             chosen = np.append(always, component)
             P = np.linalg.inv(information[np.ix_(chosen, chosen)])
-            out.append(ScoreTest(name, label, float(P[-1] @ score[chosen]), float(np.sqrt(P[-1, -1]))))
+            others = [c for c in prior if c != component]
+            by_others = P[-1] @ information[np.ix_(chosen, others)] * [prior[c] for c in others]
+            sd = float(np.sqrt(P[-1, -1] + np.sum(by_others**2)))
+            out.append(ScoreTest(name, label, float(P[-1] @ score[chosen]), sd))
     return _without_rate_noise(best, out)
 
 

@@ -20,7 +20,8 @@ event
 `SENSOR`, `LINE`    1, 1  its sensor, and in the log
 `NAME`                 1  of a place
 `FATE`                 1  0, or why it is left out
-`VALUES`               *  D components and their D sds, D as many as any sensor has, 3 at least; and the context
+`VALUES`               *  D components and their D sds, D as many as any sensor has, 3 at least, the third of two sds
+                          being a covariance; and the context
 ==================  ====  ==========================================================================================
 
 ==================  ====  ==========================================================================================
@@ -608,6 +609,7 @@ def _take(
     for i in range(dim):
         if sensor[SIGHTS] == 0:
             row[Z + i] = event[VALUES + i]
+    for i in range(max(dim, MOST)):
         row[Z + max(dim, MOST) + i] = event[VALUES + most + i]
     for i in range(context):
         row[Z + 2 * most + i] = event[VALUES + 2 * most + i]

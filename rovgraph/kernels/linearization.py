@@ -369,7 +369,7 @@ def innovate(state: Epoch, one: Measured, gravity: float, derive: bool, scratch:
                 for i in range(6):
                     by_bias += H[a, 9 + i] * one.scale[i, k]
                 H[a, MOTION + ACC_SCALE + k] = by_bias
-    whiten(row[SD : SD + dim], sensor[GAIN : GAIN + 9].reshape(3, 3)[:dim, :dim], row[RATE_SD], W)
+    whiten(row[SD:ROW], sensor[GAIN : GAIN + 9].reshape(3, 3)[:dim, :dim], row[RATE_SD], W)
     for a in range(dim):
         difference = row[Z + a] - z[a]
         z[a] = wrap(difference) if is_angular(kind) else difference

@@ -8,7 +8,8 @@ measurement
 `RATE_SD`          1  its noise [rad/s]
 `SNAPSHOT`        16  motion from the keyframe: time, dR by rows, dv, dp
 `ASSUMED`          6  bias that the motion was integrated with
-`Z`, `SD`       3, 3  components, and their noise; more of each where there are more, which no kernel takes
+`Z`, `SD`       3, 3  components, and their sds, of two of them the third is their covariance; more of each where there
+                      are more, which no kernel takes
 `CONTEXT`       0, *  where a sensor in use has it: what was known of the other end, or of a beam, when it measured
 =============  =====  ==========================================================================================
 

@@ -1,6 +1,7 @@
 """Weights of measurements: square-root information and robust losses.
 
-    W' W = (diag(sd^2) + G G' rate_sd^2)^-1, W lower triangular          G: the rate's way into the measurement
+    W' W = (S + G G' rate_sd^2)^-1, W lower triangular                   S: diag(sd^2), and the covariance of two
+                                                                         G: the rate's way into the measurement
     huber    rho = d^2 / 2, beyond k: k (d - k / 2)                      (Huber 1964)
     cauchy   rho = k^2 / 2 log(1 + d^2 / k^2)                            (Zhang 1997)
 
@@ -19,19 +20,22 @@ NONE, HUBER, CAUCHY = range(3)
 
 
 @view_helper
-def whiten(sd: Array, rate_covariance: Array, rate_sd: float, W_out: Array) -> None:
-    """Inverse of the Cholesky factor of diag(sd^2) + rate_covariance rate_sd^2, all of shape (dim, dim).
+def whiten(noise: Array, rate_covariance: Array, rate_sd: float, W_out: Array) -> None:
+    """Inverse of the Cholesky factor of S + rate_covariance rate_sd^2, all of shape (dim, dim).
 
-    ``rate_covariance`` is G G': the covariance of the measurement where that of the rate is the unit matrix.
+    ``noise`` are the sds of the components, and of two of them their covariance. ``rate_covariance`` is G G': the
+    covariance of the measurement where that of the rate is the unit matrix.
     """
-    dim = len(sd)
+    dim = len(W_out)
     for i in range(dim):  # first the factor L
         for j in range(i + 1):
             rest = rate_covariance[i, j] * rate_sd * rate_sd
+            if i > j and dim == 2:
+                rest += noise[2]
             for k in range(j):
                 rest -= W_out[i, k] * W_out[j, k]
             W_out[j, i] = 0.0
-            W_out[i, j] = math.sqrt(sd[i] * sd[i] + rest) if i == j else rest / W_out[j, j]
+            W_out[i, j] = math.sqrt(noise[i] * noise[i] + rest) if i == j else rest / W_out[j, j]
     for i in range(dim):  # then its inverse in its place
         for j in range(i):
             rest = 0.0
@@ -42,12 +46,12 @@ def whiten(sd: Array, rate_covariance: Array, rate_sd: float, W_out: Array) -> N
 
 
 @kernel(f"void({readonly_array(2)}, f8[:, ::1], {readonly_array(1)}, f8[:, :, ::1])")
-def whiten_many(sd: Array, rate_covariance: Array, rate_sd: Array, W_out: Array) -> None:
-    """`whiten` of n measurements of one sensor: ``sd`` of shape (n, dim), ``rate_sd`` of shape (n,)."""
-    one = np.empty(sd.shape[1])
-    for k in range(len(sd)):
+def whiten_many(noise: Array, rate_covariance: Array, rate_sd: Array, W_out: Array) -> None:
+    """`whiten` of n measurements of one sensor: ``noise`` of shape (n, dim), of two (n, 3), ``rate_sd`` of (n,)."""
+    one = np.empty(noise.shape[1])
+    for k in range(len(noise)):
         for i in range(len(one)):
-            one[i] = sd[k, i]
+            one[i] = noise[k, i]
         whiten(one, rate_covariance, rate_sd[k], W_out[k])
 
 

@@ -20,7 +20,7 @@ from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
-from rovgraph.log.streams import SPACING_S, label_number, precedence
+from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
@@ -125,13 +125,15 @@ class Intake:
                 lat, lon = float(values[0]), float(values[1])
                 self.origin = origin_in(self.frame or self.config.frame_at(lat), lat, lon)
             north, east = north_east(values[0], values[1], self.origin)
-            sensor, values = _STREAM[sensor], np.array([north, east, values[2]])
+            sensor, values = _STREAM[sensor], np.array([north, east, *values[2:]])
         elif sensor == "fix":
             self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
         elif self._sound.applies:
             values = self._by_sound_speed(sensor, values)
+        if sensor == "fix":  # a receiver knows less of its noise than others
+            values = np.append(values, np.full(len(STREAMS["fix"]) - len(values), np.nan))
         return None if sensor in ACOUSTICS and self._is_unplaced(sensor, values) else self._new(time, sensor, values)
 
     def _new(self, time: float, sensor: str, values: Array) -> Measurement | None:

@@ -9,9 +9,12 @@ from rovgraph.geometry import Array
 from rovgraph.log.streams import LAT_LON, SHIP_LAT_LON, THRUSTER
 from rovgraph.sensors import SENSORS
 
-# positions in latitude, longitude [deg] and sd [m], which become "fix" and "ship" once there is an origin
+# positions in latitude, longitude [deg] and noise [m], which become "fix" and "ship" once there is an origin
 GEODETIC, SHIP_GEODETIC = "geodetic", "ship_geodetic"
-ON_EARTH = {GEODETIC: (*LAT_LON, "fix_sd"), SHIP_GEODETIC: (*SHIP_LAT_LON, "ship_sd")}  # their columns
+ON_EARTH = {  # their columns
+    GEODETIC: (*LAT_LON, *SENSORS["fix"].column_names[2:]),
+    SHIP_GEODETIC: (*SHIP_LAT_LON, *SENSORS["ship"].column_names[2:]),
+}
 
 
 class Reading(NamedTuple):
@@ -68,9 +71,9 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
             values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in known.column_names])
             if known.complete is None or known.complete(values[None])[0]:
                 found.append(Reading(sensor, values))
-    for sensor, (lat, lon, sd) in ON_EARTH.items():
-        if lat in cells and lon in cells:
-            found.append(Reading(sensor, np.array([cells[lat], cells[lon], cells.get(sd, np.nan)])))
+    for sensor, columns in ON_EARTH.items():
+        if all(name in cells for name in columns[:2]):
+            found.append(Reading(sensor, np.array([cells.get(name, np.nan) for name in columns])))
     thrusters = [f"thruster_{k + 1}" for k in range(sum(THRUSTER.fullmatch(n) is not None for n in cells))]
     if thrusters and all(name in cells for name in thrusters):
         found.append(Reading("thruster", np.array([cells[n] for n in thrusters])))

@@ -22,15 +22,16 @@ COLLAPSED_M = 0.1  # span, to which no unit may shrink fixes that differ
 _PLACEHOLDER = re.compile(r"-?(9+(\.9+)?|91|181|214\.748364[78]|2147483647|2147483648)(\.0*)?")
 WHOLE = 1e-3  # of 1e-7 degrees, as which a number is whole
 _TOLD = 6  # digits
+_POSITIONS = {"fix": "fixes", "ship": "positions of the ship"}
 
 
-def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str) -> tuple[Array, Array]:
+def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str, of: str) -> tuple[Array, Array]:
     """Positions with NaN in place of invalid ones, shape (n,) each [deg].
 
     Parameters
     ----------
     lat, lon : ndarray, shape (n,), NaN = none
-    line : of the file, for messages
+    line, of : of the file, and "fix" or "ship", for messages
 
     Raises
     ------
@@ -45,7 +46,7 @@ def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str
     beyond = known & ((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
     unset = known & (lat == 0.0) & (lon == 0.0)
     if unset.any():
-        warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0 are invalid and left out")
+        warn(f"{source}: {unset.sum()} {_POSITIONS[of]} at latitude and longitude 0 are invalid and left out")
     none = np.zeros(len(lat), dtype=bool)
     none[beyond] = is_placeholder(lat[beyond]) | is_placeholder(lon[beyond])
     none |= known & (lon == 181.0) & (np.abs(lon - np.nanmedian(np.where(none | unset, np.nan, lon))) > APART_DEG)
@@ -56,28 +57,29 @@ def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str
         k = int(np.argmax(wild))
         raise InputError(
             f"{source}: line {line[k]}: latitude {lat[k]:.{_TOLD}g}, longitude {lon[k]:.{_TOLD}g}, expected degrees; "
-            + what_unit(lat[known & ~none & ~unset], lon[known & ~none & ~unset])
+            + what_unit(lat[known & ~none & ~unset], lon[known & ~none & ~unset], of)
         )
     none |= wild
     if none.any():
         k = int(np.argmax(none))
         said = f"latitude {lat[k]:.{_TOLD}g}, longitude {lon[k]:.{_TOLD}g} in line {line[k]}"
-        warn(f"{source}: {none.sum()} fixes are no positions ({said}) and left out")
+        warn(f"{source}: {none.sum()} {_POSITIONS[of]} are no positions ({said}) and left out")
     lat[none | unset] = np.nan
     return lat, lon
 
 
-def what_unit(lat: Array, lon: Array) -> str:
+def what_unit(lat: Array, lon: Array, of: str) -> str:
     """Remedy for positions that are not degrees, shape (n,) each, finite."""
     unit = unit_of(lat, lon)
     if unit == "exchanged":
-        return "they are exchanged: state columns: {fix_lat: fix_lon, fix_lon: fix_lat}, with the log's own names"
+        lat_lon = f"{of}_lat: {of}_lon, {of}_lon: {of}_lat"
+        return f"they are exchanged: state columns: {{{lat_lon}}}, with the log's own names"
     if unit == "ddmm":
         told = Scale(form="ddmm")(lat[:1])[0]
         meant = f"degrees and minutes in one number (latitude {told:.5f} deg)"
-        return f"they look like {meant}: state units: {{fix: ddmm}}"
+        return f"they look like {meant}: state units: {{{of}: ddmm}}"
     if unit == "degE7":
-        return "if they are in units of 1e-7 degrees, state units: {fix: degE7}"
+        return f"if they are in units of 1e-7 degrees, state units: {{{of}: degE7}}"
     return "write latitude and longitude in degrees"
 
 

@@ -431,7 +431,7 @@ def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
             warn(f"{source}: {lat_lon[0]} and {lat_lon[1]} are ignored beside {local[0]} and {local[1]}")
             del cells[lat_lon[0]], cells[lat_lon[1]]
             continue
-        lat, lon = valid_positions(cells[lat_lon[0]], cells[lat_lon[1]], line, source)
+        lat, lon = valid_positions(cells[lat_lon[0]], cells[lat_lon[1]], line, source, of)
         known = ~np.isnan(lat) & ~np.isnan(lon)
         cells[lat_lon[0]], cells[lat_lon[1]] = np.where(known, lat, np.nan), np.where(known, lon, np.nan)
 

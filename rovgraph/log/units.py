@@ -34,6 +34,7 @@ UNITS: dict[str, dict[str, float]] = {
     "angle": _ANGLE,
     "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "length": _LENGTH,
+    "area": {f"{unit}2": factor**2 for unit, factor in _LENGTH.items()},
     "pressure": {
         "Pa": 1.0,
         "mbar": 1e2,
@@ -67,7 +68,7 @@ _SPELLINGS = {  # as other programs write units, in small letters
     "rad/sec": "rad/s", "radians/s": "rad/s", "rads": "rad/s", "rps": "rad/s", "dps": "deg/s", "°/s": "deg/s",
     "deg/sec": "deg/s", "degrees/s": "deg/s", "degs": "deg/s", "radians": "rad", "degrees": "deg", "°": "deg",
     "e7": "dege7", "µt": "ut", "μt": "ut", "microtesla": "ut", "mgauss": "mg",
-    "meters": "m", "metres": "m", "meter": "m", "metre": "m",
+    "m²": "m2", "m^2": "m2", "meters": "m", "metres": "m", "meter": "m", "metre": "m",
     "sec": "s", "secs": "s", "seconds": "s", "msec": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns",
 }  # fmt: skip
 _STATED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
@@ -173,11 +174,13 @@ def scales(units: Mapping[str, str], source: str) -> dict[str, Scale]:
             )
         sign = 1.0 if unit == signed else -1.0
         for column in columns:
-            if unit in FORMS.get(kinds[column], ()):
-                out[column] = Scale(form=unit)
-            elif unit in UNITS[kinds[column]]:
-                factor = UNITS[kinds[column]][unit]
-                out[column] = Scale(factor * (1.0 if column.endswith("_sd") else sign))  # an sd has no sign
+            own = f"{unit}2" if kinds[column] == "area" and unit in _LENGTH else unit  # of the lengths beside it
+            if own in FORMS.get(kinds[column], ()):
+                out[column] = Scale(form=own)
+            elif own in UNITS[kinds[column]]:
+                factor = UNITS[kinds[column]][own]
+                unsigned = column.endswith("_sd") or kinds[column] == "area"
+                out[column] = Scale(factor * (1.0 if unsigned else sign))
     return out
 
 

@@ -318,7 +318,7 @@ class Config(ConfigSection):
     @field_validator("beacons")
     @classmethod
     def _of_different_names(cls, beacons: tuple[Beacon, ...]) -> tuple[Beacon, ...]:
-        names = [str(beacon.name).strip() for beacon in beacons]
+        names = [str(beacon.name).strip().removesuffix(".0") for beacon in beacons]  # as logs write numbers
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise PydanticCustomError("named_twice", f"expected different names, two beacons are named {twice}")
         return beacons

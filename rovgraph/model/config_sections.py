@@ -406,7 +406,7 @@ class Depth(ConfigSection):
 class Fix(ConfigSection):
     """Position fixes."""
 
-    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; fix_sd takes precedence")
+    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; fix_sd and fix_east_sd take precedence")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is rejected")

@@ -272,7 +272,7 @@ class Acoustics:
         length, exact = self._length(stream)
         why.append(("no length of its way: 0, or a travel time within the turn-around", ~exact))
         names, others = self._others(stream, why)
-        c, settings = self._sound_speed(sensor), self._settings(sensor)
+        c, settings = self._sound_speed(stream), self._settings(sensor)
         way, wait = length / c, settings.turn_around_s
         heard = stream.time - late
         context = np.zeros((n, at.WIDTH))
@@ -306,7 +306,7 @@ class Acoustics:
         z = np.zeros((n, dim))
         z[:, 0] = length
         if self._profile is not None:
-            self._unbend(sensor, time, z, context, others)
+            self._unbend(sensor, time, z, context, others, c)
         usable = np.ones(n, bool)
         for reason, bad in why:
             if (bad & usable).any():
@@ -323,15 +323,17 @@ class Acoustics:
     def _settings(self, sensor: str) -> Any:
         return self.config.usbl if sensor == "usbl" else self.config.range
 
-    def _sound_speed(self, sensor: str) -> float:
-        return float(self._settings(sensor).sound_speed_mps)
+    def _sound_speed(self, stream: Stream) -> Array:
+        """The speed of sound that each was made with, shape (n,) [m/s]."""
+        own = stream.data[:, -1]
+        return np.where(own > 0.0, own, self._settings(stream.sensor).sound_speed_mps)
 
     def _length(self, stream: Stream) -> tuple[Array, NDArray[np.bool_]]:
         """One-way length of each [m], 0 where it is unknown; and whether it is known."""
         settings = self._settings(stream.sensor)
         length, travel = stream.data[:, 0].copy(), stream.data[:, 1]
         ways = 1.0 if settings.one_way else 2.0
-        by_time = settings.sound_speed_mps * (travel - (0.0 if settings.one_way else settings.turn_around_s)) / ways
+        by_time = self._sound_speed(stream) * (travel - (0.0 if settings.one_way else settings.turn_around_s)) / ways
         length = np.where(np.isnan(length), by_time, length)
         if stream.sensor == "usbl":
             length = np.where(np.isnan(length), np.linalg.norm(stream.data[:, 4:7], axis=1), length)
@@ -449,9 +451,11 @@ class Acoustics:
         sd[:, 2] = np.where(level, UNKNOWN_TILT_SD, math.radians(ship.tilt_sd_deg))
         return np.asarray(sd * on_ship[:, None])
 
-    def _unbend(self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other]) -> None:
-        """Replace ranges and directions, made with one speed of sound, by those of straight lines, in place."""
-        profile, believed = self._profile, self._sound_speed(sensor)
+    def _unbend(
+        self, sensor: str, time: Array, z: Array, context: Array, others: Sequence[Other], believed: Array
+    ) -> None:
+        """Replace ranges and directions, made with believed speeds of sound, by those of straight lines, in place."""
+        profile = self._profile
         if profile is None or not len(z):
             return
         heard = context[:, at.HEARD + 2]

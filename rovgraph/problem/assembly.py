@@ -742,7 +742,7 @@ class Assembly:
         sd = instrument.sd
         if registered.standard_deviation is not of_instrument and len(values):
             sd = np.array([registered.standard_deviation(one, instrument, self.config) for one in values])
-        out[:, at.VALUES + D : at.VALUES + D + dim] = sd
+        out[:, at.VALUES + D : at.VALUES + D + sd.shape[-1]] = sd
         return out
 
     def _place_of(self, k: int) -> Place:

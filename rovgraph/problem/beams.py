@@ -96,7 +96,7 @@ def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> Wron
         text = f"{same.mean():.0%} of the beams' stamps are those of a velocity"
         late = _late(geometry, pings, dvl)
         remedy = "state delay_s.dvl_beams" if late is None else remedy_of_lag(config, BEAMS, late, 0.0)
-        return WrongHead("clock", text, f"{remedy}, or convert the native files again")
+        return WrongHead("lag", text, f"{remedy}, or convert the native files again")
     beams = beams_of(pings.data, geometry.numbers)
     return _of_velocities(config.dvl, geometry, beams, dvl.data[near], same)
 

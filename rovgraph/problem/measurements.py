@@ -183,7 +183,7 @@ class Measurements:
     @cached_property
     def W(self) -> Array:
         """Square-root information, shape (n, dim, dim), lower triangular."""
-        return whitening(self.instrument, self.problem.sd(self.index, self.instrument.model.dim), self.rate_sd)
+        return whitening(self.instrument, self.problem.noise(self.index, self.instrument.model.dim), self.rate_sd)
 
     @property
     def may_be_late(self) -> bool:
@@ -318,21 +318,21 @@ class Measurements:
         return State(out.R, out.p, out.v, out.b, state.calibration), rate_b, (F, out.c)
 
 
-def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
+def whitening(instrument: Instrument, noise: Array, rate_sd: Array) -> Array:
     """Square-root information of measurements, the noise of the rate included.
 
     Parameters
     ----------
     instrument : Instrument
-    sd : ndarray, shape (n, dim)
+    noise : ndarray, shape (n, dim), sds of the components, of two (n, 3), with their covariance
     rate_sd : ndarray, shape (n,) [rad/s]
 
     Returns
     -------
     ndarray, shape (n, dim, dim), lower triangular
     """
-    W = np.empty((*sd.shape, sd.shape[1]))
-    whiten_many(sd, instrument.rate_gain @ instrument.rate_gain.T, rate_sd, W)
+    W = np.empty((len(noise), instrument.model.dim, instrument.model.dim))
+    whiten_many(noise, instrument.rate_gain @ instrument.rate_gain.T, rate_sd, W)
     return W
 
 

@@ -168,8 +168,12 @@ class Problem:
         return self.rows[index, measured.Z : measured.Z + dim]
 
     def sd(self, index: Index, dim: int) -> Array:
-        """Their noise, shape (k, dim)."""
+        """Their sds, shape (k, dim)."""
         return self.rows[index, sd_of(dim) : sd_of(dim) + dim]
+
+    def noise(self, index: Index, dim: int) -> Array:
+        """Their sds, of fewer than three also their covariance, shape (k, dim or 3)."""
+        return self.rows[index, sd_of(dim) : sd_of(dim) + max(dim, measured.MOST)]
 
     def contexts(self, index: "slice | Index") -> Array:
         """What was known of the other end of measurements, shape (k, context)."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.disk_columns import median_step
-from rovgraph.log.streams import label_number
+from rovgraph.log.streams import LAT_LON, STREAMS, label_number
 from rovgraph.readers.acoustic_sentences import AcousticPosition, Reply, ShipAttitude, Told
 from rovgraph.readers.nmea_sentences import TRUE
 from rovgraph.readers.recording import Channel, Clock, preferred_first
@@ -37,6 +37,7 @@ LAST = ("PTSAH", "PSONALL")  # of attitudes
 INERTIAL = ("PTSAX", "PTSAY")  # of a GAPS, whose own filter makes PTSAG of them with what it knows of the ship
 BRIDGE = "UGPS"  # the transponder that Water Linked's bridge to Olex names
 NAMES = ("PSIM", "PTSA", "PSON", "USRTH", "USBL", "MicronNav", "SeaTrac")  # of acoustic sentences
+FIX = *LAT_LON, *STREAMS["fix"][2:]  # columns
 TWICE = "beside depth of the same sensor it is one measurement taken twice"
 NO_GRID = "on a grid that is not stated, and not UTM of the ship's zone within 20 km of her"
 AS_UTM = "is on a grid that it does not state; it is taken as UTM on WGS 84 in the ship's zone"
@@ -432,12 +433,13 @@ class ShipsFile:
             if known.any():
                 sd = np.array([reply.sd for _, reply in rows])
                 cells = zip(when[known], np.column_stack([lat, lon, sd])[known], strict=True)
-                made[name] = self._channel("fix", name, _in_time(cells, ("fix_lat", "fix_lon", "fix_sd")))
+                made[name] = self._channel("fix", name, _in_time(cells, FIX[:3]))
         return made
 
 
 def _fixes(rows: Iterable[tuple[float, AcousticPosition]]) -> dict[str, Array]:
-    return _in_time(((t, (p.lat, p.lon, p.sd)) for t, p in rows), ("fix_lat", "fix_lon", "fix_sd"))
+    columns = _in_time(((t, (p.lat, p.lon, *p.noise)) for t, p in rows), FIX)
+    return {name: values for name, values in columns.items() if name not in FIX[3:] or not np.isnan(values).all()}
 
 
 def _in_time(rows: Iterable[tuple[float, Iterable[float]]], names: Sequence[str]) -> dict[str, Array]:

@@ -19,7 +19,7 @@ down; what is no reply is refused with its reason. Fields count from 1 after the
 ``PTSAX``, ``PTSAY``    1 to 6 the same, 7, 8 x forward and y starboard, or north and east, 9 hydrophones, 10 depth,
                         11 its validity
 ``PTSAH``               2 heading
-``PSONLLD``             1 UTC, 2 beacon, 3 status, 4, 5 degrees, 6 depth, 7, 8 semi-axes (1 sd)
+``PSONLLD``             1 UTC, 2 beacon, 3 status, 4, 5 degrees, 6 depth, 7, 8 semi-axes (1 sd), 9 direction of 7
 ``PSONALL``             1 name, 3 time, 4, 5 easting and northing, 6 depth, 7 heading, 10 pitch, 11 roll, 13 sd
 ``USRTH``               2 bearing in the receiver's axes, 3 elevation (up), 4 slant range, 6, 7 both relative to north
 ``USBLLONG``            1 time now, 2 time of measurement, 3 remote, 4 to 6 x, y, z, 13 one-way propagation time [us],
@@ -45,6 +45,7 @@ from typing import Literal
 from rovgraph.log.stamps import DAY_S
 from rovgraph.readers.nmea_sentences import has_checksum, number
 from rovgraph.readers.records import Refused, shown
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 HALF_HOUR_S = 1800.0
 FARTHEST_M = 20e3  # of a reply: farther, eastings and northings were taken for a relative position
@@ -53,6 +54,7 @@ LEAST_HYDROPHONES = 3
 WORST_FIT = 3.0  # of a SeaTrac's head, from which on its direction is wrong
 NO_REPLY, NO_POSITION = "no reply", "no position"
 Frame = Literal["transducer", "ship", "north"]
+Noise = tuple[float, float, float]  # sd of north; of east, and covariance, where they are not alike and independent
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,9 @@ class AcousticPosition:
 
     Attributes
     ----------
-    kind, beacon, when, sd, filtered : as of a `Reply`; the sd is that of one coordinate
+    kind, beacon, when, filtered : as of a `Reply`
     lat, lon : NaN where it comes on a grid [deg]
+    noise : NaN = not stated [m], [m2]
     grid : its two coordinates, in either order, on a grid that is not stated; () = it has none [m]
     of_ship : it is that of the ship
     """
@@ -141,7 +144,7 @@ class AcousticPosition:
     when: When
     lat: float
     lon: float
-    sd: float = math.nan
+    noise: Noise = (math.nan, math.nan, math.nan)
     grid: tuple[float, ...] = ()
     of_ship: bool = False
     filtered: bool = False
@@ -294,12 +297,21 @@ def _on_earth(lat: float, lon: float) -> tuple[float, float]:
     return lat, lon
 
 
-def _ellipse_sd(major: str, minor: str) -> float:
-    """Sd of one coordinate, of the semi-axes of an error ellipse [m]."""
-    a, b = number(major), number(minor)
+def _alike(sd: float) -> Noise:
+    """Noise whose directions are all alike."""
+    return sd, math.nan, math.nan
+
+
+def _ellipse(semi_axis: str, other: str, direction: str = "") -> Noise:
+    """Noise of an error ellipse whose axes are known, and the direction of the first from north [m, deg]."""
+    a, b, turn = number(semi_axis), number(other), number(direction)
     if a is None or b is None or min(a, b) < 0.0 or a + b <= 0.0:
-        return math.nan
-    return math.sqrt(0.5 * (a * a + b * b))
+        return _alike(math.nan)
+    mean, half = 0.5 * (a * a + b * b), 0.5 * (a * a - b * b)
+    if turn is None or min(a, b) == 0.0:  # no ellipse, but how far it is off
+        return _alike(math.sqrt(mean))
+    along, across = half * math.cos(math.radians(2.0 * turn)), half * math.sin(math.radians(2.0 * turn))
+    return math.sqrt(mean + along), math.sqrt(mean - along), across
 
 
 # Kongsberg
@@ -316,10 +328,11 @@ def _psimssb(cells: Cells) -> Told:
     when, smoothed = _when(clock, HALF_HOUR_S), filtered == "F"
     if system == "D":
         lat, lon = _degrees(cells[8], cells[9], 90.0), _degrees(cells[10], cells[11], 180.0)
-        return AcousticPosition(kind, beacon, when, lat, lon, _accuracy(cells[13]), filtered=smoothed)
+        return AcousticPosition(kind, beacon, when, lat, lon, _alike(_accuracy(cells[13])), filtered=smoothed)
     if system == "U":
         x, y = _numbers(cells, 8, 9)
-        return AcousticPosition(kind, beacon, when, math.nan, math.nan, _accuracy(cells[11]), (x, y), filtered=smoothed)
+        noise = _alike(_accuracy(cells[11]))
+        return AcousticPosition(kind, beacon, when, math.nan, math.nan, noise, (x, y), filtered=smoothed)
     if system != "C":
         raise Refused(NO_POSITION, "neither in Cartesian coordinates relative to a ship nor in degrees")
     x, y, depth = _numbers(cells, 8, 9, 10)
@@ -339,8 +352,8 @@ def _psimlbp(cells: Cells) -> Told:
     if cells[4] != "A":
         raise Refused(NO_POSITION, "the system marks it as not OK")
     x, y = _numbers(cells, 6, 7)
-    sd = _ellipse_sd(cells[9], cells[10])
-    return AcousticPosition(cells[0], cells[2], _when(cells[1], HALF_HOUR_S), math.nan, math.nan, sd, (x, y))
+    noise = _ellipse(cells[9], cells[10])  # whether its direction is in degrees is not known
+    return AcousticPosition(cells[0], cells[2], _when(cells[1], HALF_HOUR_S), math.nan, math.nan, noise, (x, y))
 
 
 # iXblue GAPS
@@ -409,8 +422,9 @@ def _psonlld(cells: Cells) -> Told:
     if status != "A":
         raise Refused(NO_POSITION, "the system marks it as not OK")
     lat, lon = _on_earth(*_numbers(cells, 4, 5))
-    sd = _ellipse_sd(cells[7], cells[8])
-    return AcousticPosition(kind, beacon.strip(), _when(clock), lat, lon, sd, of_ship=_of_ship(beacon))
+    of_ship = _of_ship(beacon)
+    noise = _ellipse(cells[7], cells[8], "" if of_ship else cells[9])
+    return AcousticPosition(kind, beacon.strip(), _when(clock), lat, lon, noise, of_ship=of_ship)
 
 
 def _psonall(cells: Cells) -> Told:
@@ -420,7 +434,8 @@ def _psonall(cells: Cells) -> Told:
         return ShipAttitude(kind, when, _heading(cells[7]), _angle(cells[11]), _angle(cells[10]))
     east, north = _numbers(cells, 4, 5)
     sd = number(cells[13])
-    return AcousticPosition(kind, beacon, when, math.nan, math.nan, math.nan if sd is None else sd, (east, north))
+    noise = _alike(math.nan if sd is None else sd)
+    return AcousticPosition(kind, beacon, when, math.nan, math.nan, noise, (east, north))
 
 
 # Cerulean ROVL, EvoLogics S2C, Tritech MicronNav
@@ -517,7 +532,7 @@ def _seatrac(text: str) -> Told:
     if kind not in _FIXES:
         raise Refused("other", "no measurement that a log has")
     try:
-        _, beacon, flags, *_ = _HEAD.unpack_from(fix)
+        _, beacon, flags, *_, speed, _ = _HEAD.unpack_from(fix)
         at = _HEAD.size
         if flags & 3 != 3:
             raise Refused(NO_POSITION, "no range and direction")
@@ -535,6 +550,8 @@ def _seatrac(text: str) -> Told:
         "usbl_bearing": math.radians(0.1 * azimuth),
         "usbl_elevation": -math.radians(0.1 * elevation),
     }
+    if SLOWEST_MPS < 0.1 * speed < FASTEST_MPS:
+        columns["usbl_sound_speed"] = 0.1 * speed
     return Reply("SeaTrac", str(beacon), NOW, "transducer", columns)
 
 

@@ -27,7 +27,7 @@ COLUMNS = {
     "ahrs": QUATERNION,
     "mag": ("mag_x", "mag_y", "mag_z"),
     "depth": ("pressure",),
-    "fix": ("fix_lat", "fix_lon", "fix_sd"),
+    "fix": ("fix_lat", "fix_lon", "fix_sd", "fix_east_sd", "fix_cov_ne"),
     "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_valid", "dvl_sd"),
     "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
     "dvl_altitude": ("dvl_altitude",),
@@ -78,9 +78,10 @@ def _pressure(message: Any) -> Iterator[RosReading]:
 def _fix(message: Any) -> Iterator[RosReading]:
     if message.status.status < 0 or not (math.isfinite(message.latitude) and math.isfinite(message.longitude)):
         raise Unusable("no fix")
-    variance = 0.5 * (message.position_covariance[0] + message.position_covariance[4])
-    known = message.position_covariance_type != 0 and variance > 0.0
-    yield RosReading("fix", (message.latitude, message.longitude, math.sqrt(variance) if known else math.nan))
+    east, covariance, north = (float(message.position_covariance[k]) for k in (0, 1, 4))
+    known = message.position_covariance_type != 0 and north > 0.0 and east > 0.0
+    noise = (math.sqrt(north), math.sqrt(east), covariance) if known else (math.nan,) * 3
+    yield RosReading("fix", (message.latitude, message.longitude, *noise))
 
 
 def _velocity(xyz: Any, valid: bool, sd: float, water: bool = False) -> Iterator[RosReading]:

@@ -4,7 +4,7 @@ An exchange of sound is one equation (`rovgraph.kernels.measurements`); its numb
 the other end was, and the direction that was measured. `rovgraph.problem.acoustics` puts them together.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
-SLOWEST_MPS = 1400.0  # sound in water
 MOST_ELEVATION = 0.5 * np.pi + 1e-6
 
 
@@ -89,19 +89,19 @@ def ranging(config: Config, origin_b: Array) -> Instrument:
 Masks = Iterator[tuple[str, NDArray[np.bool_]]]
 
 
-def _impossible(length: int, time: int) -> Callable[[Array, Config], Masks]:
-    """What is no way of sound, by the columns of range and travel time."""
-
-    def refused(values: Array, config: Config) -> Masks:
-        r, t = values[:, length], values[:, time]
-        yield "range of 0 or less", (r <= 0.0) | (t <= 0.0)
-        yield "farther than sound reaches", (r > FARTHEST_M) | (t > 2.0 * FARTHEST_M / SLOWEST_MPS)
-
-    return refused
+def _impossible(values: Array, config: Config) -> Masks:
+    """What is no way of sound: range and travel time are the first columns, and the speed of sound is the last."""
+    r, t, c = values[:, 0], values[:, 1], values[:, -1]
+    yield "range of 0 or less", (r <= 0.0) | (t <= 0.0)
+    yield "farther than sound reaches", (r > FARTHEST_M) | (t > 2.0 * FARTHEST_M / SLOWEST_MPS)
+    yield (
+        f"a speed of sound beyond {SLOWEST_MPS:.0f} to {FASTEST_MPS:.0f} m/s",
+        (c > 0.0) & (c < SLOWEST_MPS) | (c > FASTEST_MPS),
+    )
 
 
 def _impossible_direction(values: Array, config: Config) -> Masks:
-    yield from _impossible(0, 1)(values, config)
+    yield from _impossible(values, config)
     yield "elevation beyond 90 degrees", np.abs(values[:, 3]) > MOST_ELEVATION
 
 
@@ -117,6 +117,7 @@ def _is_range(values: Array) -> NDArray[np.bool_]:
 
 
 DEGREES = 0.1  # share of angles beyond a full circle, which only degrees have
+PLUMB, OFTEN = 1e-4, 0.2  # from 90 degrees [rad], in a share of replies that no vehicle below the head has
 LARGEST_TILT = 0.35  # rms of a ship's roll or pitch [rad]
 
 
@@ -135,6 +136,23 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
             "error",
             f"its angles reach {largest:.4g} rad; if they are in degrees, state units: {{{key}: deg}}",
             "unit",
+        )
+    plumb = int((np.abs(np.abs(values[:, 3]) - 0.5 * np.pi) < PLUMB).sum())
+    if plumb > max(OFTEN * len(values), 1):
+        text = f"its elevation is 90 degrees in {plumb} of {len(values)} replies, which stands for none"
+        yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
+
+
+def _look_at_place(values: Array, config: Config) -> Iterator[Said]:
+    start = config.start
+    begin = np.array([start.north_m or 0.0, start.east_m or 0.0])
+    away = float(np.hypot(*(np.median(values[:, :2], axis=0) - begin)))
+    if start.located and away > FARTHEST_M:
+        yield (
+            "warning",
+            f"the ship is {away / 1e3:.0f} km from where the dive begins, start.north_m {begin[0]:g}, "
+            f"start.east_m {begin[1]:g}: if these are eastings and northings of a grid, state the start on it, or null",
+            "start",
         )
 
 
@@ -161,6 +179,7 @@ USBL = Sensor(
         Column("usbl_beacon", optional=True, label=True),
         Column("usbl_range_sd", "length", optional=True, largest=1e3),
         Column("usbl_angle_sd", "angle", optional=True, group="usbl_direction", largest=1.6),
+        Column("usbl_sound_speed", "speed", optional=True),
     ),
     positioning_head,
     refused=_impossible_direction,
@@ -178,9 +197,10 @@ RANGE = Sensor(
         Column("range_beacon", optional=True, label=True),
         Column("range_receiver", optional=True, label=True),
         Column("range_sd", "length", optional=True, largest=1e3),
+        Column("range_sound_speed", "speed", optional=True),
     ),
     ranging,
-    refused=_impossible(0, 1),
+    refused=_impossible,
     observes=Observed("position"),
     may_begin_later=True,
     occasional=True,
@@ -195,6 +215,7 @@ SHIP = Sensor(
     ),
     may_begin_later=True,
     occasional=True,
+    look=_look_at_place,
 )
 SHIP_HEADING = Sensor(
     "ship_heading",

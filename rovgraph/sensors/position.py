@@ -13,7 +13,7 @@ from rovgraph.model.calibration import LAYOUT
 from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
-from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument, own_sd
+from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Said, Sensor, instrument, own_sd
 
 AIR_DBAR, SAME_AIR_M = (9.5, 10.5), 0.3  # of the air's pressure, and how much it changes in a dive
 DIVED_M = 2.0  # more than waves
@@ -84,6 +84,25 @@ def positioning(config: Config, origin_b: Array) -> Instrument:
     return instrument(fix, model, fix.sd_m, ("north", "east"), time_offset="fix_time_offset")
 
 
+def _noise_of_fix(values: Array, believed: Instrument, config: Config) -> Array:
+    """Sds of north and of east, and their covariance, shape (3,); what is not known is the instrument's."""
+    return np.asarray(_noise_of_fixes(values[None], believed.sd[0])[0])
+
+
+def _noise_of_fixes(values: Array, sd: float) -> Array:
+    """The same of n fixes, shape (n, 3)."""
+    own, own_east, covariance = values[:, 2:].T
+    north = np.where(own > 0.0, np.minimum(own, LARGEST_SD), sd)  # receivers without an estimate write 0
+    east = np.where(own_east > 0.0, np.minimum(own_east, LARGEST_SD), north)
+    return np.column_stack([north, east, np.nan_to_num(covariance)])
+
+
+def _impossible(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    north, east, covariance = _noise_of_fixes(values, config.fix.sd_m).T
+    why = "|fix_cov_ne| is not below fix_sd times fix_east_sd, as every covariance is; check its unit, m2"
+    yield why, np.abs(covariance) >= north * east
+
+
 def _too_deep(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     yield "deeper than any sea", np.abs(values[:, 0]) > DEEPEST_M
 
@@ -135,9 +154,12 @@ FIX = Sensor(
         Column("fix_north", "length"),
         Column("fix_east", "length"),
         Column("fix_sd", "length", optional=True, largest=5e3),
+        Column("fix_east_sd", "length", optional=True, largest=5e3),
+        Column("fix_cov_ne", "area", optional=True),
     ),
     positioning,
-    standard_deviation=own_sd(2),  # receivers without an estimate write 0
+    refused=_impossible,
+    standard_deviation=_noise_of_fix,
     observes=Observed("position", (0, 1)),
     may_begin_later=True,
     occasional=True,

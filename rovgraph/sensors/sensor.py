@@ -31,7 +31,7 @@ NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
 MOSTLY = 0.5  # share of a sensor's sds, from which on they are placeholders; fewer belong to uninformative measurements
 
-Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length", "pressure"]
+Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length", "area", "pressure"]
 Frame = Literal["position", "velocity", "heading"]
 Level = Literal["ok", "warning", "error"]
 # what a check may find: data that are wrong, and remain so in an estimate; or not
@@ -210,7 +210,7 @@ class Sensor:
     refused : from columns, shape (n, k), and the configuration to reasons to leave measurements out, each with a
         mask, shape (n,); the first that holds counts
     standard_deviation : from the columns of one measurement, shape (k,), the instrument and the configuration to its
-        sd, shape (dim,)
+        sd, shape (dim,), or of two components to both sds and their covariance, shape (3,)
     once_per_interval : taken once between keyframes, as its errors last longer than that
     observes : what a filter inflates when it readmits the sensor
     linear_in : of built-in sensors, the variable that the model is linear in whatever the others are, which gives

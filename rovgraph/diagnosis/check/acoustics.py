@@ -325,7 +325,7 @@ class _Lag:
 
 def _signed(stream: Stream, bearing: float = 1.0, elevation: float = 1.0) -> Stream:
     """Replies with bearings or elevations of the other sign."""
-    return replace(stream, data=stream.data * np.array([1, 1, bearing, elevation, 1, bearing, elevation, 1, 1, 1]))
+    return replace(stream, data=stream.data * np.array([1, 1, bearing, elevation, 1, bearing, elevation, 1, 1, 1, 1]))
 
 
 def positions(log: Log, config: Config) -> Iterator[Finding]:

@@ -391,7 +391,8 @@ def start(log: Log, config: Config) -> Iterator[Finding]:
         return
     away = np.hypot(first.data[:, 0] - (stated.north_m or 0.0), first.data[:, 1] - (stated.east_m or 0.0))
     way = _way(np.linalg.norm(pings.data[:, :2], axis=1), pings.time, begin, first.time)
-    fix_sd = float(np.nanmedian(np.where(np.isnan(first["fix_sd"]), config.fix.sd_m, first["fix_sd"])))
+    own_sd = np.fmax(first["fix_sd"], first["fix_east_sd"])
+    fix_sd = float(np.median(np.where(np.isnan(own_sd), config.fix.sd_m, own_sd)))
     arm = float(np.hypot(*config.fix.lever_arm_m[:2]))
     beyond = float(np.median(away - way)) - arm
     if beyond > SURE * np.hypot(stated.position_sd_m, fix_sd):

@@ -187,7 +187,7 @@ def _check(cells: dict[str, float]) -> None:
     """Raise `Refused` for values that are finite and cannot be."""
     if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
         raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
-    for name in ("dvl_sd", "fix_sd", "ship_sd", "place_sd"):
+    for name in ("dvl_sd", "fix_sd", "fix_east_sd", "ship_sd", "place_sd"):
         if cells.get(name, 1.0) <= 0.0:  # as many instruments mark a missing estimate
             del cells[name]
     for names in (LAT_LON, SHIP_LAT_LON):

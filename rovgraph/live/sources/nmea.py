@@ -193,7 +193,7 @@ class NmeaDecoder:
         if isinstance(told, AcousticPosition) and told.of_ship:
             if not self._fixes.takes(told.kind, time) or not math.isfinite(told.lat):
                 return ()
-            return self._of_the_ship(Reading(GEODETIC, np.array([told.lat, told.lon, told.sd])), time)
+            return self._of_the_ship(Reading(GEODETIC, np.array([told.lat, told.lon, told.noise[0]])), time)
         if isinstance(told, AcousticPosition):
             return self._position(told, time)
         joined = self._directions.joined(told)
@@ -216,7 +216,7 @@ class NmeaDecoder:
             if there is None:
                 raise Refused("grid", f"{told.kind} is {NO_GRID}")
             lat, lon = there
-        return (Reading(GEODETIC, np.array([lat, lon, told.sd])),)
+        return (Reading(GEODETIC, np.array([lat, lon, *told.noise])),)
 
     def _reply(self, told: Reply, time: float) -> tuple[Reading, ...]:
         """A reply as it was measured, or as a fix."""

@@ -80,10 +80,10 @@ def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
 
 
 def _geodetic(log: Log) -> dict[int, Array]:
-    """Line -> latitude, longitude, sd, where the log has its fixes in degrees, as a receiver gives them."""
+    """Line -> latitude, longitude and noise, where the log has its fixes in degrees, as a receiver gives them."""
     if log.origin is None or "fix" not in log:
         return {}
     fix = log["fix"]
-    north, east, sd = fix.data.T
+    north, east, *noise = fix.data.T
     lat, lon = lat_lon(north, east, log.origin)
-    return dict(zip(fix.row.tolist(), np.column_stack([lat, lon, sd]), strict=True))
+    return dict(zip(fix.row.tolist(), np.column_stack([lat, lon, *noise]), strict=True))
