@@ -62,12 +62,16 @@ def pd0_ensemble(
     bottom: bool = True,
     date: Sequence[int] | None = None,
     more: Sequence[bytes] = (),
+    profile: Sequence[Sequence[float]] = (),
 ) -> bytes:
     """An ensemble, its velocities those of the bottom [m/s]; roll, pitch, heading [rad], bias and alignment [deg].
 
-    ``more`` are other records.
+    ``more`` are other records, ``profile`` velocities of the water in cells of 4 m, the first one at 6.5 m [m/s].
     """
+    cells = struct.pack("<H", 0x0100) + b"".join(struct.pack("<4h", *in_mm(cell)) for cell in profile)
     fixed = bytearray(59)
+    struct.pack_into("<B2xH", fixed, 9, len(profile), 400)
+    struct.pack_into("<H", fixed, 32, 650)
     struct.pack_into("<HBBHxxB", fixed, 0, 0x0000, 50, 40, 0x4249 | (0x80 if up else 0) | 0x08, 4)
     struct.pack_into("<BhhB", fixed, 25, (system << 3) | 0b111, round(100 * alignment), round(100 * bias), source)
     fixed[58] = 30
@@ -83,9 +87,7 @@ def pd0_ensemble(
     struct.pack_into("<12B", track, 32, *[heard] * 4, *[80] * 4, *[100] * 4)
     struct.pack_into("<4h", track, 50, *in_mm(water))
     struct.pack_into("<4B", track, 77, *(r >> 16 for r in far))
-    return ensemble(
-        bytes(fixed), bytes(variable), struct.pack("<H8h", 0x0100, *range(8)), *[bytes(track)] * bottom, *more
-    )
+    return ensemble(bytes(fixed), bytes(variable), cells, *[bytes(track)] * bottom, *more)
 
 
 def winriver_gga(clock: str, before: float, lat: float, lon: float, quality: int = 2, hdop: float = 0.9) -> bytes:

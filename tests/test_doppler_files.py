@@ -104,6 +104,54 @@ def test_a_simulated_dive_comes_back_of_pd0_from_all_coordinates_within_its_reso
     np.testing.assert_allclose(first(recording, "dvl_altitude").columns["dvl_altitude"], 3.0)
 
 
+@pytest.mark.parametrize(("system", "up"), WAYS)
+def test_cells_of_a_profile_are_velocities_relative_to_the_water_at_their_own_depths(system, up, tmp_path):
+    rpy, printed = np.array([0.1, 0.2, 0.7]), np.array([0.1, 0.2, 0.7])
+    rpy[1] = np.arctan(np.tan(rpy[1]) * np.cos(rpy[0]))
+    relative = np.column_stack([0.5 - 0.02 * np.arange(6), 0.03 * np.arange(6), np.full(6, 0.2)])
+    cells = [-trdi_values(v, system, rpy, up) for v in relative]
+    cells[2], cells[4] = [np.nan] * 4, [0.0] * 4  # the instrument marks the one so, an older one the other
+    data = b"".join(
+        pd0_ensemble(UNIX + k, system=system, rpy=printed + k * 1e-3, up=up, profile=cells, ranges=(70, 60, 80, 0))
+        for k in range(2)
+    )
+    recording = read(data, tmp_path)
+    table = recording.tables["adcp"]
+    beams = system == BEAM and not up
+    level = np.cos(rpy[0]) * np.cos(rpy[1]) if system >= SHIP else 1.0  # depths of bins that it has mapped
+    here = table["time"] < UNIX + 0.5
+    close(table["range"][here] * level, 6.5 + 4.0 * np.array([0, 1, 3, 5]), 5e-4)
+    close(table["cell"][here] * level, np.full(4, 4.0), 5e-4)
+    close(table["bottom"], np.full(8, 60.0))
+    close(np.column_stack([table["roll"], table["pitch"]])[here], np.tile(rpy[:2], (4, 1)), 1e-4)
+    assert recording.settings["water"] == {"beam_angle_deg": 30.0} | ({"looks": "up"} if up else {})
+    if beams:
+        assert recording.settings["dvl"]["beams"] == {"angle_deg": 30.0, "azimuth_deg": [270.0, 90.0, 0.0, 180.0]}
+        head = beam_geometry(parse_config("dvl: {beams: {angle_deg: 30, azimuth_deg: [270, 90, 0, 180]}}").dvl)
+        along = np.column_stack([table[f"beam_{k}"] for k in range(1, 5)])
+        found = velocity_by_beams(head.directions, along, np.isfinite(along))[0]
+    else:
+        found = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    close(found[here], relative[[0, 1, 3, 5]], 0.0012)
+
+
+def test_of_two_profilers_in_one_file_the_one_that_looks_down_is_kept(tmp_path):
+    cells = [(0.1, 0.2, 0.3, 0.0)] * 3
+    data = b"".join(pd0_ensemble(UNIX + k, up=k % 2 == 0, profile=cells) for k in range(5))
+    recording = read(data, tmp_path)
+    close(np.unique(recording.tables["adcp"]["time"]), UNIX + np.array([1.0, 3.0]), 0.006)
+    assert [(each.name, each.count) for each in recording.left if each.reason == "looks the other way"] == [
+        ("profile", 3)
+    ]
+
+
+def test_the_error_velocity_shows_the_noise_of_a_cell(tmp_path):
+    rng = np.random.default_rng(4)
+    data = b"".join(pd0_ensemble(UNIX + k, profile=rng.normal(0.0, [[0.02], [0.06]], (2, 4))) for k in range(800))
+    table = read(data, tmp_path).tables["adcp"]
+    np.testing.assert_allclose(table["sd"][:2], [0.02, 0.06], rtol=0.1)
+
+
 def test_ensembles_of_two_coordinate_systems_in_one_file_agree(tmp_path):
     moved, rpy = (0.5, 0.1, -0.05), (0.0, 0.3, 2.0)
     data = [pd0_ensemble(UNIX + k, -trdi_values(moved, k % 4, rpy), k % 4, (0.0, 0.3, 2.0)) for k in range(8)]
@@ -387,6 +435,42 @@ def test_a_remus_dive_keeps_its_attitude_in_its_own_axes():
     steep = np.isfinite(below) & (np.abs(tilt["pitch"]) > 0.15) & (np.abs(descent) < 1.0)
     assert np.count_nonzero(steep) > 100
     assert np.std((descent - below)[steep]) < 0.5 * np.std((descent - moved[:, 2])[steep])  # if they were level
+
+
+def test_a_remus_profile_agrees_with_an_independent_decoding():
+    table = real("remus600_pd0/adcp_auv_51.pd0").tables["adcp"]
+    expected = YAML(typ="safe").load((DATA / "remus600_pd0" / "adcp_auv_51.expected.yml").read_text())["data"]
+    profiles = [one for one in expected if one["particle_type"] == "adcp_velocity_earth"]
+    down = [one for one in profiles if one["sysconfig_vertical_orientation"] == 0]
+    names = "water_velocity_north", "water_velocity_east", "water_velocity_up"  # in this file ahead, right, up
+    ahead, right, up = (np.concatenate([one[name] for one in down]).astype(float) for name in names)
+    heard = ahead != -32768
+    close(table["vx"], -1e-3 * ahead[heard], 1e-9)
+    close(table["vy"], -1e-3 * right[heard], 1e-9)
+    close(table["vz"], 1e-3 * up[heard], 1e-9)
+    first = np.concatenate([0.01 * (one["bin_1_distance"] + one["cell_length"] * np.arange(8)) for one in down])
+    close(table["range"], first[heard], 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "fastest", "scatter"),
+    [("remus600_pd0/adcp.adc.gz", 1.0, 0.12), ("glider_pd0/ooi_glider_NE051400.PD0", 0.05, 0.12)],
+)
+def test_the_water_stands_still_beside_the_bottom_whichever_way_a_vehicle_goes(name, fastest, scatter):
+    """Current = velocity over the bottom less that relative to the cells, in Earth axes."""
+    recording = real(name)
+    table, heading = recording.tables["adcp"], next(c for c in recording.channels if c.sensor.endswith("heading"))
+    over, pings = velocity(recording), first(recording, "dvl").columns["time"]
+    ping = np.searchsorted(pings, table["time"])
+    azimuth = np.unwrap(heading.columns[heading.sensor.replace("vehicle_", "")])
+    rpy = np.column_stack([table["roll"], table["pitch"], np.interp(table["time"], heading.columns["time"], azimuth)])
+    R_ns = matrix_from_rpy(rpy)
+    relative = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    known = np.isfinite(over[ping]).all(axis=1) & (table["range"] < 0.8 * np.nan_to_num(table["bottom"]))
+    moved, current = (np.einsum("nij,nj->ni", R_ns, v)[known, :2] for v in (over[ping], over[ping] - relative))
+    assert len(current) > 800 and np.median(np.abs(moved)) > fastest
+    assert 1.48 * np.median(np.abs(current - np.median(current, axis=0))) < scatter
+    assert np.all(np.abs(np.median(current, axis=0)) < 0.2)
 
 
 def test_a_gliders_corrupt_file_gives_its_good_ensembles():

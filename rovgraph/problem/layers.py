@@ -207,7 +207,7 @@ class WaterLayers:
         if math.isnan(depth):
             left_out[CELLS, f"without a depth within {FRESH_S:g} s"] += len(data)
             return empty, first
-        down_b = _level(imu, time)
+        down_b = self._down(data, imu, time)
         bottom = np.nanmin(data[:, _COLUMN["adcp_bottom"]], initial=self._altitude(time))
         limit = depth if self.config.water.looks == "up" else bottom
         data = self._admitted(data, limit * self._cosine, left_out)
@@ -223,6 +223,11 @@ class WaterLayers:
         within = place < first + K - 1
         left_out[CELLS, "beyond the knots of the current"] += int((~within).sum())
         return self._rows(place[within], Cells(*(a[within] for a in cells)), first), first
+
+    def _down(self, data: Array, imu: Array, time: float) -> Array:
+        """Direction down in b, shape (3,), by the instrument's own tilt where the table has it, else by the IMU."""
+        tilt = data[0, [_COLUMN["adcp_roll"], _COLUMN["adcp_pitch"]]]
+        return self._R_bs @ matrix_from_rpy([*tilt, 0.0])[2] if np.isfinite(tilt).all() else _level(imu, time)
 
     def _admitted(self, data: Array, far: float, left_out: Left) -> Array:
         """Cells that may be used; their far end is nearer than ``far`` [m]."""

@@ -23,7 +23,7 @@ from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
-from rovgraph.log.companions import beams_frame
+from rovgraph.log.companions import columns_beside
 from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
@@ -235,7 +235,7 @@ def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
     if BEAMS in log:
         error = error_velocity(log[BEAMS].data, config.dvl)
-        frame = beams_frame(log[BEAMS])
+        frame = pd.DataFrame(columns_beside(log[BEAMS]))
         frame = frame if np.isnan(error).all() else frame.assign(error_velocity=error)
         write_csv(frame, folder / BEAMS_FILE, decimals={"time": 4})
     bottom = bottom_of(log, config, main)
