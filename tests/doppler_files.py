@@ -210,6 +210,17 @@ def signature_record(stamp: float, beams: Sequence[int], system: int = 2, heard:
     return nortek_record(0x17, 0x10, bytes(head) + data)
 
 
+def profile_record(stamp: float, values: np.ndarray, system: int, beams: int = 4) -> bytes:
+    """Average of a profile by a Signature, cells of 2 m after 0.5 m, shape (cells, 4); roll 3, pitch -2, heading 90."""
+    head = bytearray(76)
+    struct.pack_into("<BBHI6BH", head, 0, 3, 76, 0x20, 7, *_nortek_date(stamp), round(1e4 * (stamp % 1.0)))
+    packed = beams << 12 | system << 10 | len(values)
+    struct.pack_into("<HhIHhhHHH", head, 16, 15000, 1000, 5000, 9000, -200, 300, packed, 2000, 50)
+    struct.pack_into("<b9xI", head, 58, -3, 0b10)
+    raw = np.where(np.isfinite(values), np.round(1000.0 * np.nan_to_num(values)), BAD).astype("<i2")
+    return nortek_record(0x16, 0x10, bytes(head) + raw.T.tobytes())
+
+
 def nucleus_record(kind: int, stamp: float, values: Sequence[float], status: int = 0xFFFF, posix: bool = True) -> bytes:
     """A Nucleus's record of 32-bit numbers, behind 12 bytes that all have and 24 more."""
     second, rest = divmod(round(1e6 * stamp), 1_000_000)

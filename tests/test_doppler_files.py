@@ -22,6 +22,7 @@ from doppler_files import (
     pd0_ensemble,
     pd4_frame,
     pd6_ping,
+    profile_record,
     signature_record,
     trdi_values,
     vmdas_navigation,
@@ -36,6 +37,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 from wire import sentence
 
+from rovgraph import read_log
 from rovgraph.api.conversion import convert
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import matrix_from_rpy
@@ -133,6 +135,20 @@ def test_cells_of_a_profile_are_velocities_relative_to_the_water_at_their_own_de
     else:
         found = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
     close(found[here], relative[[0, 1, 3, 5]], 0.0012)
+
+
+def test_profiles_stay_beside_a_log_that_is_converted_again(tmp_path):
+    cells = [(0.1, 0.2, 0.03, 0.0), (0.1, 0.25, 0.03, 0.0)]
+    pd0, log, again = (tmp_path / name for name in ("dive.pd0", "log.csv", "again.csv"))
+    pd0.write_bytes(b"".join(pd0_ensemble(UNIX + k, source=1, profile=cells) for k in range(5)))
+    with pytest.warns(DataWarning, match="nothing measured it"):
+        made = convert([pd0])
+    made.save(log)
+    convert([log]).save(again)
+    for read_back in (made.log["adcp"], read_log(log)["adcp"], read_log(again)["adcp"]):
+        close(read_back["adcp_vx"], np.tile([-0.2, -0.25], 5))
+        close(read_back["adcp_range"], np.tile([6.5, 10.5], 5))
+        close(read_back.time - read_back.time[0], np.repeat(np.arange(5.0), 2), 0.006)
 
 
 def test_of_two_profilers_in_one_file_the_one_that_looks_down_is_kept(tmp_path):
@@ -533,6 +549,50 @@ def test_a_signatures_profile_is_that_of_its_beams_by_the_makers_own_matrix():
     preset = parse_config("dvl: {preset: nortek-signature}").dvl
     found, _ = velocity_by_beams(beam_geometry(preset).directions, away, np.isfinite(away))
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-4)  # the matrix has five digits
+
+
+def test_an_ad2cp_profile_agrees_with_its_makers_own_decoding():
+    table = real("adcp_bt/VelEchoBT01.ad2cp.gz").tables["adcp"]
+    with gzip.open(DATA / "adcp_bt" / "VelEchoBT01.mat.gz") as file:
+        made = loadmat(file, simplify_cells=True)
+    for k in (1, 2, 3, 4):
+        close(table[f"beam_{k}"], -made["Data"][f"Burst_VelBeam{k}"].ravel().astype(float), 1e-6)
+    blank, cell = made["Config"]["Burst_BlankingDistance"], made["Config"]["Burst_CellSize"]
+    close(table["range"], np.tile(blank + cell * np.arange(1, 31), 160), 1e-6)
+    assert "vx" not in table and np.all(table["cell"] == cell)
+
+
+@pytest.mark.parametrize("system", [0, 1, 2])
+def test_cells_of_a_nortek_profile_are_relative_to_the_water_in_all_coordinates(system, tmp_path):
+    rpy = np.deg2rad([3.0, -2.0, 90.0])  # of `profile_record`, which looks up: X forward, Y to port, Z up
+    relative = np.column_stack([0.5 - 0.1 * np.arange(3), 0.1 * np.arange(3), np.full(3, -0.05)])
+    R = Rotation.from_euler("ZYX", [np.pi / 2 - rpy[2], -rpy[1], rpy[0]])  # from there to east, north, up
+    cells = -R.apply(relative) if system == 0 else -relative
+    if system == 2:
+        head = beam_geometry(parse_config("dvl: {preset: nortek-signature}").dvl)
+        values = cells @ head.directions.T
+    else:
+        values = np.column_stack([cells, cells[:, 2]])
+    values[1] = np.nan
+    data = b"".join(profile_record(UNIX + k, values, system) for k in range(3))
+    recording = read(data, tmp_path)
+    table = recording.tables["adcp"]
+    close(table["range"], np.tile([0.5 + 2.0, 0.5 + 6.0], 3))
+    if system == 2:
+        along = np.column_stack([table[f"beam_{k}"] for k in range(1, 5)])
+        found = velocity_by_beams(head.directions, along, np.isfinite(along))[0]
+        assert recording.settings["dvl"]["beams"]["angle_deg"] == 25.0
+    else:
+        found = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    close(found, np.tile(relative[[0, 2]], (3, 1)), 0.002)
+    assert sensors(recording) >= {"depth", "dvl_heading", "vehicle_tilt"}  # without bottom track, of its records
+
+
+def test_a_nortek_profile_of_other_beams_is_counted_and_left_out(tmp_path):
+    track, odd = signature_record(UNIX, [100] * 4), profile_record(UNIX, np.zeros((3, 4)), 2, beams=3)
+    recording = read(track + odd, tmp_path)
+    assert "adcp" not in recording.tables
+    assert any(each.count == 1 and "four beams" in each.reason for each in recording.left)
 
 
 def solved(name: str) -> tuple[Log, np.ndarray]:
