@@ -1,6 +1,7 @@
 """Native files of Doppler instruments: Teledyne PD0, PD4, PD5, PD6, Nortek AD2CP, DVL and Nucleus."""
 
 import gzip
+import struct
 import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -163,9 +164,23 @@ def test_of_two_profilers_in_one_file_the_one_that_looks_down_is_kept(tmp_path):
 
 def test_the_error_velocity_shows_the_noise_of_a_cell(tmp_path):
     rng = np.random.default_rng(4)
-    data = b"".join(pd0_ensemble(UNIX + k, profile=rng.normal(0.0, [[0.02], [0.06]], (2, 4))) for k in range(800))
-    table = read(data, tmp_path).tables["adcp"]
-    np.testing.assert_allclose(table["sd"][:2], [0.02, 0.06], rtol=0.1)
+    noise = rng.normal(0.0, [[0.02], [0.06]], (800, 2, 4))
+    data = b"".join(pd0_ensemble(UNIX + k, profile=profile) for k, profile in enumerate(noise))
+    sd = read(data, tmp_path).tables["adcp"]["sd"]  # of ten groups
+    np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.02, 0.06], rtol=0.1)
+    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [70, 60, 110, 110])
+    data = b"".join(pd0_ensemble(UNIX + k, profile=profile[::-1], more=[of_beams]) for k, profile in enumerate(noise))
+    sd = read(data, tmp_path).tables["adcp"]["sd"]  # by the third best correlation, whatever the cell's number
+    np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.06, 0.02], rtol=0.1)
+
+
+def test_cells_of_three_beams_are_left_out_where_others_have_four(tmp_path):
+    four, three = (0.1, 0.2, 0.03, 0.01), (0.1, 0.2, 0.03, np.nan)
+    recording = read(b"".join(pd0_ensemble(UNIX + k, profile=[four, four, three]) for k in range(4)), tmp_path)
+    assert np.all(recording.tables["adcp"]["range"] < 11.0)
+    assert any(each.name == "cell" and each.count == 4 for each in recording.left)
+    every = read(b"".join(pd0_ensemble(UNIX + k, profile=[three]) for k in range(4)), tmp_path)
+    assert len(every.tables["adcp"]["time"]) == 4
 
 
 def test_ensembles_of_two_coordinate_systems_in_one_file_agree(tmp_path):
@@ -460,7 +475,7 @@ def test_a_remus_profile_agrees_with_an_independent_decoding():
     down = [one for one in profiles if one["sysconfig_vertical_orientation"] == 0]
     names = "water_velocity_north", "water_velocity_east", "water_velocity_up"  # in this file ahead, right, up
     ahead, right, up = (np.concatenate([one[name] for one in down]).astype(float) for name in names)
-    heard = ahead != -32768
+    heard = np.concatenate([one["error_velocity"] for one in down]) != -32768  # of four beams
     close(table["vx"], -1e-3 * ahead[heard], 1e-9)
     close(table["vy"], -1e-3 * right[heard], 1e-9)
     close(table["vz"], 1e-3 * up[heard], 1e-9)

@@ -21,7 +21,7 @@ from rovgraph.model.config import Config, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.calibration_roles import unknowns
-from rovgraph.problem.layers import WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.problem.layers import UNLIKE, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
 from rovgraph.sensors.dvl import DvlVelocity
 from rovgraph.sensors.dvl_beam import beam_geometry
 from rovgraph.sensors.water_layer import ADCP, CELLS, WaterLayer
@@ -57,7 +57,7 @@ def context(rows: Stream) -> Array:
 def test_rows_of_a_profile_hold_all_that_its_cells_say():
     """Least squares by the rows and by the cells themselves give the same velocities and covariance."""
     rng = np.random.default_rng(1)
-    far, v = np.arange(3.0, 43.0, 4.0), rng.normal(0.0, 0.3, (10, 3))
+    far, v = np.arange(3.0, 43.0, 4.0), rng.normal(0.0, [0.3, 0.3, 0.02], (10, 3))
     sd = rng.uniform(0.03, 0.1, 10)
     made = layers("water: {knots: 8, cell_correlation: 0}")
     rows = made.of(cells(10.0, range=far, vx=v[:, 0], vy=v[:, 1], vz=v[:, 2], sd=sd), LEVEL, None, Counter())
@@ -103,6 +103,20 @@ def test_a_bottom_that_the_table_does_not_mark_is_known_by_the_altitude():
     far, zero, left = np.arange(2.0, 30.0, 3.0), np.zeros(10), Counter()
     layers("water: {knots: 8}", altitude=15.0).of(cells(10.0, range=far, vx=zero, vy=zero, vz=zero), LEVEL, None, left)
     assert sum(left.values()) == np.count_nonzero(far > 15.0 * np.cos(np.pi / 6))
+
+
+def test_cells_that_rise_or_sink_unlike_those_beside_them_are_left_out():
+    """As the last ones of a real profile do, where echoes are faint; on a tilted head too."""
+    rpy = np.array([0.1, -0.4, 0.0])
+    v_n = np.tile([0.3, -0.2, 0.5], (9, 1))
+    v_n[:, 0] += 0.05 * np.arange(9)
+    v_n[[3, 8], 2] += 0.2
+    v = v_n @ matrix_from_rpy(rpy)
+    by, left = {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")}, Counter()
+    layers("water: {knots: 8}").of(
+        cells(10.0, range=np.arange(2.0, 20.0, 2.0), roll=rpy[0], pitch=rpy[1], **by), LEVEL, None, left
+    )
+    assert left == {(CELLS, UNLIKE): 2}
 
 
 def test_beams_of_a_tilted_head_are_taken_at_the_depth_of_the_cell():

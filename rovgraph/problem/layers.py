@@ -45,6 +45,8 @@ TOGETHER_S = 1e-4  # stamps of the cells of one profile
 SAME_M = 1e-6  # depths that differ by rounding
 FILLED = 1e-9  # part of a knot's weight below which no cell is near it
 OUT_OF_SIGHT = 1e3  # sd by which what stood in a knot's place before is forgotten [m/s]
+BESIDE, UNLIKE_SD = 2, 6.0  # cells on each side that a cell is compared with, and how far it may be off
+UNLIKE = "rising or sinking unlike the cells beside them"
 SIDE_LOBES = "at the bottom or the surface (side lobes)"
 _COLUMN = {name: k for k, name in enumerate(ADCP.column_names)}
 Left = Counter[tuple[str, str]]
@@ -212,6 +214,9 @@ class WaterLayers:
         limit = depth if self.config.water.looks == "up" else bottom
         data = self._admitted(data, limit * self._cosine, left_out)
         cells = self._cells(data, down_b)
+        alike = self._alike(cells, self._R_bs.T @ down_b)
+        left_out[CELLS, UNLIKE] += int((~alike).sum())
+        cells = Cells(*(a[alike] for a in cells))
         if not len(cells.down):
             return empty, first
         head, spacing, K = depth + float(self._below_sensor @ down_b), self.config.water.knot_m, len(self._places)
@@ -262,10 +267,28 @@ class WaterLayers:
         good = np.isfinite(v).all(axis=1)
         return Cells(down[good], v[good], data[good, _COLUMN["adcp_sd"]])
 
+    def _relative(self, sd: Array) -> Array:
+        """Noise of cells over the one that is believed, shape (n,)."""
+        believed = self.config.water.cell_sd_mps[0]
+        return np.where(np.isfinite(sd), np.minimum(sd, LARGEST_SD), believed) / believed
+
+    def _alike(self, cells: Cells, down_s: Array) -> NDArray[np.bool_]:
+        """Cells of whose vertical velocity two on each side do not show that it is far off."""
+        n = len(cells.down)
+        alike = np.ones(n, bool)
+        if n > BESIDE:
+            order = np.argsort(cells.down)
+            vertical = cells.velocity[order] @ down_s
+            padded = np.pad(vertical, BESIDE, constant_values=np.nan)
+            median = np.nanmedian([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            sd = self._relative(cells.sd[order]) * self.config.water.cell_sd_mps[2]
+            alike[order] = np.abs(vertical - median) <= UNLIKE_SD * sd
+        return alike
+
     def _rows(self, place: Array, cells: Cells, first: int) -> Array:
         """At most one measurement between two knots; ``place`` is the depth of each cell in knots."""
         believed, rho = np.array(self.config.water.cell_sd_mps), self.config.water.cell_correlation
-        relative = np.where(np.isfinite(cells.sd), np.minimum(cells.sd, LARGEST_SD), believed[0]) / believed[0]
+        relative = self._relative(cells.sd)
         K = len(self._places)
         above = np.floor(place).astype(np.int64) - first if K > 1 else np.zeros(len(place), np.int64)
         share, weight = place - np.floor(place), 1.0 / np.square(relative)

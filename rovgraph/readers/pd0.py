@@ -47,9 +47,9 @@ from rovgraph.readers.trdi import (
 from rovgraph.sensors.water_layer import CELLS
 
 SYNC = b"\x7f\x7f"
-FIXED, VARIABLE, PROFILE, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0100, 0x0600, 0x2000
+FIXED, VARIABLE, PROFILE, CORRELATION, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0100, 0x0200, 0x0600, 0x2000
 SENTENCES, GGA, HEADING = 0x2022, 0x2101, 0x2104  # of receivers: decoded by WinRiver, and as text
-SEVERAL = (PROFILE, SENTENCES, GGA, HEADING)
+SEVERAL = (PROFILE, CORRELATION, SENTENCES, GGA, HEADING)
 
 LAYOUTS = {
     FIXED: layout(
@@ -88,7 +88,6 @@ LAYOUTS = {
 LEAST = {FIXED: 42, VARIABLE: 40, BOTTOM: 48, NAVIGATION: 24}  # bytes, as older firmware writes them
 OTHERS = {
     0x0001: "fixed leader of another kind",
-    0x0200: "correlation profile",
     0x0300: "echo intensity profile",
     0x0400: "percent-good profile",
     0x0500: "status profile",
@@ -200,7 +199,7 @@ def _keep(found: Ensembles, table: list[tuple[int, int]], end: int) -> None:
 ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 BAD = -32768
 MAPPED = 0b1  # cells by their depths
-FEWEST = 30  # error velocities that show the noise of a cell
+FEWEST, MOST_GROUPS = 30, 10  # error velocities that show the noise of cells, and groups of them
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
 THERMOMETER, COMPUTED_SOUND = 0b1, 0b100_0000  # the temperature does; the speed of sound follows from what is measured
@@ -514,6 +513,11 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
     by_cell = Attitude(rpy, *(a[of] for a in (attitude.tilted, attitude.upward, attitude.beam_angle, attitude.convex)))
     velocity, error = forward_starboard_down(values, system, by_cell)
     along = (system == BEAM) & (pings.head is not None)
+    alike, number = found.records_of(content, CORRELATION, layout(("value", f"({most},4)u1", 2)))
+    third = np.zeros((len(found), most))
+    third[number] = np.sort(alike["value"], axis=2)[:, :, 1]
+    sd = _noise(error, third[of, cell], cell)
+    of_three = np.isnan(error) & ~along & (np.isfinite(error).sum() > 0.5 * len(of))
     mapped = (system >= SHIP) & by_cell.tilted & (fixed["coordinates"][of] & MAPPED != 0)
     level = np.where(mapped, np.cos(rpy[:, 0]) * np.cos(rpy[:, 1]), 1.0)  # by it, ranges of these are depths
     tilted = bool(np.ptp(pings.rpy[:, :2], axis=0).any())
@@ -523,10 +527,11 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         "cell": 0.01 * fixed["length"][of] / level,
         **dict(zip(("vx", "vy", "vz"), np.where(along, np.nan, -velocity.T), strict=True)),
         **{f"beam_{k + 1}": np.where(along, values[:, k], np.nan) for k in range(4)},
-        "sd": _noise(error, cell),
+        "sd": sd,
         "bottom": np.fmin.reduce(pings.range, axis=1)[of],
         **({"roll": rpy[:, 0], "pitch": rpy[:, 1]} if tilted else {}),
     }
+    left = ("profile", away, "looks the other way"), ("cell", of_three, "of three beams")
     settings = {**made.settings, "water": {"beam_angle_deg": round(float(np.rad2deg(by_cell.beam_angle.max())), 3)}}
     if up.any() and not away.any():
         settings["water"]["looks"] = "up"
@@ -534,24 +539,23 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         settings["dvl"] = {"beams": beams_setting(pings.head)} | settings.get("dvl", {})
     return replace(
         made,
-        left=(*made.left, *([Left("profile", int(away.sum()), "looks the other way")] if away.any() else [])),
+        left=(*made.left, *(Left(what, int(bad.sum()), why) for what, bad, why in left if bad.any())),
         settings=settings,
-        tables={**made.tables, CELLS: {n: v for n, v in cells.items() if np.isfinite(v).any()}},
+        tables={**made.tables, CELLS: {n: v[~of_three] for n, v in cells.items() if np.isfinite(v).any()}},
     )
 
 
-def _noise(error: Array, cell: NDArray[np.int64]) -> Array:
-    """Noise of a horizontal axis in each cell, by the error velocities of cells of its number; NaN where few have one.
+def _noise(error: Array, correlation: Array, cell: NDArray[np.int64]) -> Array:
+    """Noise of a horizontal axis, by the error velocities of cells of like correlation, shape (n,); NaN = not known.
 
-    The error velocity has the variance of X and of Y.
+    The error velocity has the variance of X and of Y. Without correlations, cells of like number stand together.
     """
-    known = np.isfinite(error)
-    out = np.full(len(error), np.nan)
-    for k in np.unique(cell[known]).tolist():
-        of = np.abs(error[known & (cell == k)])
-        if len(of) >= FEWEST and np.median(of) > 0.0:
-            out[cell == k] = 1.4826 * np.median(of)
-    return out
+    out, known = np.full(len(error), np.nan), np.flatnonzero(np.isfinite(error))
+    order = known[np.lexsort((cell[known], correlation[known]))]
+    if len(order) >= FEWEST:
+        for group in np.array_split(order, min(MOST_GROUPS, len(order) // FEWEST)):
+            out[group] = 1.4826 * np.median(np.abs(error[group]))
+    return np.where(out > 0.0, out, np.nan)
 
 
 def _attitude(fixed: NDArray[np.void], system: NDArray[np.integer], rpy: Array) -> Attitude:
