@@ -116,7 +116,7 @@ def test_cells_that_rise_or_sink_unlike_those_beside_them_are_left_out():
     layers("water: {knots: 8}").of(
         cells(10.0, range=np.arange(2.0, 20.0, 2.0), roll=rpy[0], pitch=rpy[1], **by), LEVEL, None, left
     )
-    assert left == {(CELLS, UNLIKE): 2}
+    assert +left == {(CELLS, UNLIKE): 2}
 
 
 def test_beams_of_a_tilted_head_are_taken_at_the_depth_of_the_cell():
