@@ -168,17 +168,21 @@ def test_the_error_velocity_shows_the_noise_of_a_cell(tmp_path):
     data = b"".join(pd0_ensemble(UNIX + k, profile=profile) for k, profile in enumerate(noise))
     sd = read(data, tmp_path).tables["adcp"]["sd"]  # of ten groups
     np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.02, 0.06], rtol=0.1)
-    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [70, 60, 110, 110])
+    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [75, 60, 110, 110])
     data = b"".join(pd0_ensemble(UNIX + k, profile=profile[::-1], more=[of_beams]) for k, profile in enumerate(noise))
     sd = read(data, tmp_path).tables["adcp"]["sd"]  # by the third best correlation, whatever the cell's number
     np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.06, 0.02], rtol=0.1)
 
 
-def test_cells_of_three_beams_are_left_out_where_others_have_four(tmp_path):
+def test_cells_of_three_beams_or_low_correlation_are_left_out_where_others_are_better(tmp_path):
     four, three = (0.1, 0.2, 0.03, 0.01), (0.1, 0.2, 0.03, np.nan)
     recording = read(b"".join(pd0_ensemble(UNIX + k, profile=[four, four, three]) for k in range(4)), tmp_path)
     assert np.all(recording.tables["adcp"]["range"] < 11.0)
     assert any(each.name == "cell" and each.count == 4 for each in recording.left)
+    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [63, 60, 110, 110])
+    faint = read(b"".join(pd0_ensemble(UNIX + k, profile=[four, four], more=[of_beams]) for k in range(4)), tmp_path)
+    assert len(faint.tables["adcp"]["time"]) == 4
+    assert any(each.reason == "low correlation" and each.count == 4 for each in faint.left)
     every = read(b"".join(pd0_ensemble(UNIX + k, profile=[three]) for k in range(4)), tmp_path)
     assert len(every.tables["adcp"]["time"]) == 4
 

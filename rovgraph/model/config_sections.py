@@ -321,6 +321,9 @@ class Water(ConfigSection):
     cell_sd_mps: PositiveTriple = Field(
         (0.05, 0.05, 0.02), description="noise of a cell's velocity, DVL axes; sd of the table takes precedence"
     )
+    vertical_sd_mps: NotNegative = Field(
+        0.05, description="motion of the water up and down, which is not estimated; to the noise of the DVL's z axis"
+    )
     cell_correlation: Annotated[float, Field(ge=0, lt=0.5)] = Field(
         0.15, description="correlation of neighbouring cells, by which their noise is widened"
     )

@@ -314,7 +314,8 @@ class WaterLayers:
             context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
             context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
             context[[at.SHARE, at.FIRST_KNOT]] = before / total, first
-            out.append(np.concatenate([q / total, widened / total, context, [float(k)]]))
+            sd = np.hypot(widened / total, [0.0, 0.0, self.config.water.vertical_sd_mps])
+            out.append(np.concatenate([q / total, sd, context, [float(k)]]))
         return np.array(out).reshape(-1, 7 + at.LAYER_WIDTH)
 
 

@@ -199,6 +199,7 @@ def _keep(found: Ensembles, table: list[tuple[int, int]], end: int) -> None:
 ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 BAD = -32768
 MAPPED = 0b1  # cells by their depths
+FAINT = 64  # correlation that Teledyne's instruments want at least, of 128 [counts]
 FEWEST, MOST_GROUPS = 30, 10  # error velocities that show the noise of cells, and groups of them
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
@@ -518,6 +519,7 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
     third[number] = np.sort(alike["value"], axis=2)[:, :, 1]
     sd = _noise(error, third[of, cell], cell)
     of_three = np.isnan(error) & ~along & (np.isfinite(error).sum() > 0.5 * len(of))
+    faint = ~of_three & (third[of, cell] < FAINT) & third.any()
     mapped = (system >= SHIP) & by_cell.tilted & (fixed["coordinates"][of] & MAPPED != 0)
     level = np.where(mapped, np.cos(rpy[:, 0]) * np.cos(rpy[:, 1]), 1.0)  # by it, ranges of these are depths
     tilted = bool(np.ptp(pings.rpy[:, :2], axis=0).any())
@@ -531,7 +533,11 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         "bottom": np.fmin.reduce(pings.range, axis=1)[of],
         **({"roll": rpy[:, 0], "pitch": rpy[:, 1]} if tilted else {}),
     }
-    left = ("profile", away, "looks the other way"), ("cell", of_three, "of three beams")
+    left = (
+        ("profile", away, "looks the other way"),
+        ("cell", of_three, "of three beams"),
+        ("cell", faint, "low correlation"),
+    )
     settings = {**made.settings, "water": {"beam_angle_deg": round(float(np.rad2deg(by_cell.beam_angle.max())), 3)}}
     if up.any() and not away.any():
         settings["water"]["looks"] = "up"
@@ -541,7 +547,7 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         made,
         left=(*made.left, *(Left(what, int(bad.sum()), why) for what, bad, why in left if bad.any())),
         settings=settings,
-        tables={**made.tables, CELLS: {n: v[~of_three] for n, v in cells.items() if np.isfinite(v).any()}},
+        tables={**made.tables, CELLS: {n: v[~(of_three | faint)] for n, v in cells.items() if np.isfinite(v).any()}},
     )
 
 
