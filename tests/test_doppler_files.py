@@ -503,7 +503,7 @@ def test_the_water_stands_still_beside_the_bottom_whichever_way_a_vehicle_goes(n
     relative = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
     known = np.isfinite(over[ping]).all(axis=1) & (table["range"] < 0.8 * np.nan_to_num(table["bottom"]))
     moved, current = (np.einsum("nij,nj->ni", R_ns, v)[known, :2] for v in (over[ping], over[ping] - relative))
-    assert len(current) > 800 and np.median(np.abs(moved)) > fastest
+    assert len(current) > 700 and np.median(np.abs(moved)) > fastest
     assert 1.48 * np.median(np.abs(current - np.median(current, axis=0))) < scatter
     assert np.all(np.abs(np.median(current, axis=0)) < 0.2)
 

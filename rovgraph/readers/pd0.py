@@ -545,7 +545,7 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         settings["dvl"] = {"beams": beams_setting(pings.head)} | settings.get("dvl", {})
     return replace(
         made,
-        left=(*made.left, *(Left(what, int(bad.sum()), why) for what, bad, why in left if bad.any())),
+        left=(*made.left, *(Left(what, int(bad.sum()), why) for what, bad, why in unused if bad.any())),
         settings=settings,
         tables={**made.tables, CELLS: {n: v[~(of_three | faint)] for n, v in cells.items() if np.isfinite(v).any()}},
     )
