@@ -533,11 +533,8 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
         "bottom": np.fmin.reduce(pings.range, axis=1)[of],
         **({"roll": rpy[:, 0], "pitch": rpy[:, 1]} if tilted else {}),
     }
-    left = (
-        ("profile", away, "looks the other way"),
-        ("cell", of_three, "of three beams"),
-        ("cell", faint, "low correlation"),
-    )
+    unused = [("cell", of_three, "of three beams"), ("cell", faint, "low correlation")]
+    unused.append(("profile", away, "looks the other way"))
     settings = {**made.settings, "water": {"beam_angle_deg": round(float(np.rad2deg(by_cell.beam_angle.max())), 3)}}
     if up.any() and not away.any():
         settings["water"]["looks"] = "up"
