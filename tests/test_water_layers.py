@@ -201,8 +201,8 @@ def descent() -> tuple[Log, Config]:
     from fault_campaign.instruments import log_table
     from fault_campaign.water import Profiler
 
-    setting = water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0, knots=4)
-    dive, table = water.make_dive(setting, 1)
+    dive, table = water.make_dive(water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0), 1)
+    dive.configuration["water"]["knots"] = 4
     config = Config.model_validate(dive.configuration)
     log = Log.from_frame(log_table(dive.streams), config)
     return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
