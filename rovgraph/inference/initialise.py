@@ -492,9 +492,9 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     if beams:
         assumptions.append(f"pings of the DVL by their {len(beams) - 1} beams, at {config.dvl.beams.angle_deg:g} deg")
     assumptions += [why_not] if why_not else []
-    layers, why_not = layer_sensors(config, log.streams)
+    layers, why_not = layer_sensors(config, log.streams, expected)
     if layers:
-        config = with_knots(config, log.streams)
+        config = with_knots(config, log.streams, whole=not expected)
         knots, spacing = config.water.knots, config.water.knot_m
         said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
         assumptions.append(f"profiles of the water are used; the current: {said}")

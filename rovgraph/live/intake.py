@@ -29,6 +29,7 @@ from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.pressure import DepthByPressure
+from rovgraph.sensors.water_layer import CELLS
 
 _STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship", "pressure": "depth"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
@@ -182,10 +183,10 @@ class Intake:
         return True
 
     def _names(self, sensor: str, values: Array) -> list[float]:
-        """Those of its values that stand for names."""
+        """Those of its values that tell measurements of one time apart."""
         if sensor not in self._name_columns:
             columns = SENSORS[sensor].columns if sensor in SENSORS else ()
-            self._name_columns[sensor] = [k for k, column in enumerate(columns) if column.label]
+            self._name_columns[sensor] = [k for k, c in enumerate(columns) if c.label or c.name == "adcp_range"]
         return [float(values[k]) for k in self._name_columns[sensor]]
 
     def _with_known_sd(self, sensor: str, values: Array) -> Array:
@@ -310,7 +311,8 @@ class Startup:
         self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]
-        sections = {name: getattr(self.config, name) for name in ACOUSTICS}
+        sections: dict[str, object] = {name: getattr(self.config, name) for name in ACOUSTICS}
+        sections[CELLS] = self.config.water
         unstated = {name for name, section in sections.items() if section == type(section)()}  # as a whole file has it
         later = [s for s in later if s.name not in unstated]
         expected = {s.name for s in later if s.heading_source is None or named}

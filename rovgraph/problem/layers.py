@@ -17,7 +17,7 @@ velocity relative to a layer between two knots; they hold all that the cells say
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import copy
 from typing import NamedTuple
 
@@ -52,10 +52,12 @@ _COLUMN = {name: k for k, name in enumerate(ADCP.column_names)}
 Left = Counter[tuple[str, str]]
 
 
-def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[str], str]:
-    """The sensor that a log's profiles become; and why not, if not so."""
+def layer_sensors(
+    config: Config, streams: Mapping[str, Stream], expected: Collection[str] = ()
+) -> tuple[list[str], str]:
+    """The sensor that a log's profiles become, or those that are expected; and why not, if not so."""
     if CELLS not in streams or not config.water.use:
-        return [], ""
+        return [WATER_LAYER] if CELLS in expected and config.water.use else [], ""
     left = "profiles of the water are left out: "
     cells, columns = streams[CELLS].data, _COLUMN
     measured = np.isfinite(cells[:, [columns[name] for name in (*VELOCITIES, *ALONG, *EARTH)]])
@@ -63,7 +65,7 @@ def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[s
         return [], left + "no velocities, expected adcp_vx, adcp_beam_1 or adcp_north"
     if not np.isfinite(cells[:, columns["adcp_range"]]).any():
         return [], left + "cells without ranges; give column range, from the head to the middle of each cell"
-    if "depth" not in streams:
+    if "depth" not in {*streams, *expected}:
         return [], left + "the log has no depth"
     earth = measured[:, len(VELOCITIES) + len(ALONG) :].any()
     if earth and not np.isfinite(cells[:, [columns[name] for name in ATTITUDE]]).all(axis=1).any():
@@ -76,14 +78,17 @@ def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[s
     return [WATER_LAYER], ""
 
 
-def with_knots(config: Config, streams: Mapping[str, Stream]) -> Config:
-    """The configuration with as many knots as the cells of a log reach over, farther apart where these are too few."""
+def with_knots(config: Config, streams: Mapping[str, Stream], whole: bool = True) -> Config:
+    """The configuration with as many knots as the cells of a log reach over, farther apart where these are too few.
+
+    Where it is not the ``whole`` log, cells that reach further may come: then all knots there can be.
+    """
     if config.water.knots is not None:
         return config
-    far = streams[CELLS].data[:, _COLUMN["adcp_range"]]
+    far = streams[CELLS].data[:, _COLUMN["adcp_range"]] if CELLS in streams else np.zeros(0)
     reach = float(np.nanmax(far, initial=0.0))
     spacing = max(config.water.knot_m, reach / (len(LAYERS) - 2))
-    knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS))
+    knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS)) if whole else len(LAYERS)
     water = config.water.model_copy(update={"knots": max(knots, 2), "knot_m": spacing})
     return config.model_copy(update={"water": water})
 
