@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rovgraph import smooth
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
@@ -262,3 +263,22 @@ def test_with_one_knot_a_layer_has_the_equation_of_water_track():
     assert layer[1].keys() == track[1].keys()
     for name, by in track[1].items():
         np.testing.assert_array_equal(layer[1][name], by)
+
+
+def test_the_current_of_a_dive_is_what_it_was_and_is_in_its_results(descent, tmp_path):
+    """At the depths of its knots, within their sds; the page draws it."""
+    from fault_campaign.water import draw
+
+    from rovgraph.report.pages.dive import dive_section
+    from rovgraph.report.pages.source import DiveSource
+
+    log, config = descent
+    done = smooth(log, config)
+    found = done.main.current
+    true = draw(np.random.default_rng([29, 1]), 250.0).at(found["depth"].to_numpy(), found["time"].to_numpy())
+    off = (found[["north", "east"]].to_numpy() - true) / found[["north_sd", "east_sd"]].to_numpy()
+    assert len(found) > 50 and set(np.diff(np.unique(found["depth"]))) == {10.0}
+    assert np.abs(off).max() < 4.0 and 0.3 < np.sqrt(np.mean(off**2)) < 1.6
+    source = DiveSource(tmp_path / "out", done.save(tmp_path / "out", figures=False, page=False))
+    panels = {item.title: item for item in dive_section(source).items}
+    assert len(panels["Current north"].traces[0]["marker"]["color"]) == len(found)
