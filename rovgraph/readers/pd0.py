@@ -511,7 +511,7 @@ def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles
     of = ensemble[row]
     system, rpy = pings.system[of], attitude.rpy[of]
     values = np.where(heard[row, cell], 0.001 * raw[row, cell], np.nan)
-    by_cell = Attitude(rpy, *(a[of] for a in (attitude.tilted, attitude.upward, attitude.beam_angle, attitude.convex)))
+    by_cell = Attitude(rpy, attitude.tilted[of], attitude.upward[of], attitude.beam_angle[of], attitude.convex[of])
     velocity, error = forward_starboard_down(values, system, by_cell)
     along = (system == BEAM) & (pings.head is not None)
     alike, number = found.records_of(content, CORRELATION, layout(("value", f"({most},4)u1", 2)))
