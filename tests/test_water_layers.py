@@ -1,8 +1,11 @@
 """Profiles of the water: what becomes of their cells, and that chain, filter and live dives know the current alike."""
 
+import json
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +18,8 @@ from rovgraph.inference.initialise import initialise
 from rovgraph.inference.smoother import assemble
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import FIRST_KNOT
+from rovgraph.live.outputs.json_lines import json_line
+from rovgraph.live.sources.json_lines import JsonRow
 from rovgraph.log import Log, Stream
 from rovgraph.log.companions import usable_cells
 from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
@@ -23,6 +28,7 @@ from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.layers import UNLIKE, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.readers.records import Refused
 from rovgraph.sensors.dvl import DvlVelocity
 from rovgraph.sensors.dvl_beam import beam_geometry
 from rovgraph.sensors.water_layer import ADCP, CELLS, WaterLayer
@@ -282,3 +288,41 @@ def test_the_current_of_a_dive_is_what_it_was_and_is_in_its_results(descent, tmp
     source = DiveSource(tmp_path / "out", done.save(tmp_path / "out", figures=False, page=False))
     panels = {item.title: item for item in dive_section(source).items}
     assert len(panels["Current north"].traces[0]["marker"]["color"]) == len(found)
+
+
+def test_a_dive_online_knows_the_current_as_its_filter_does(descent):
+    from live import flown
+
+    log, config = descent
+    solutions = flown(SimpleNamespace(log=log, config=config), rate=1.0).solutions
+    filtered = smooth(log, config, "filtered").main.trajectory
+    last = solutions[-1]
+    k = int(np.abs(filtered.time - last.time).argmin())
+    np.testing.assert_allclose(last.position, filtered.p_n[k], atol=0.05 * last.position_sd[0])
+    np.testing.assert_allclose(last.position_sd, np.sqrt(np.diag(filtered.cov_p[k])), rtol=0.05)
+    assert [at.depth for at in last.current] == [100.0, 110.0, 120.0, 130.0]
+    assert json.loads(json_line(last))["current"][0]["depth"] == 100.0
+    assert not any("layer" in label for label in last.calibration)
+
+
+def test_profiles_that_a_section_states_may_begin_later(descent):
+    from live import flown
+
+    log, config = descent
+    late = replace(log, streams={**log.streams, CELLS: log[CELLS].take(log[CELLS].time > 20.0)})
+    late = replace(late, streams={name: s.take(s.time < 30.0) for name, s in late.streams.items()})
+    assert flown(SimpleNamespace(log=late, config=config), rate=1.0).solutions[-1].current
+    unstated = config.model_copy(update={"water": Config().water})
+    assert not flown(SimpleNamespace(log=late, config=unstated), rate=1.0).solutions[-1].current
+
+
+def test_a_json_line_may_hold_a_profile():
+    row = JsonRow("-", lambda *_, **__: None, parse_config("units: {adcp_velocity: -mm/s}"))
+    profile = [{"range": 4.0, "vx": 100, "vy": 0, "vz": -20}, {"range": 8.0, "vx": 120, "vy": None, "vz": 0}]
+    message = row.message(json.dumps({"time": 7.0, "depth": 3.0, "adcp": profile}).encode(), 0.0)
+    assert [reading.sensor for reading in message.readings] == ["depth", CELLS, CELLS]
+    first = dict(zip(NAMES, message.readings[1].values, strict=True))
+    assert message.stamp == 7.0 and first["adcp_range"] == 4.0
+    assert first["adcp_vx"] == pytest.approx(-0.1) and first["adcp_vz"] == pytest.approx(0.02)
+    with pytest.raises(Refused, match="expected a list of cells"):
+        row.message(b'{"time": 7.0, "adcp": 3}', 0.0)
