@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rovgraph import smooth
+from rovgraph.diagnosis.check.dvl import profiles
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
@@ -326,3 +327,34 @@ def test_a_json_line_may_hold_a_profile():
     assert first["adcp_vx"] == pytest.approx(-0.1) and first["adcp_vz"] == pytest.approx(0.02)
     with pytest.raises(Refused, match="expected a list of cells"):
         row.message(b'{"time": 7.0, "adcp": 3}', 0.0)
+
+
+def findings(log: Log, config: Config) -> dict[str, str]:
+    return {f.kind: f.text for f in profiles(log, config) if f.level == "warning"}
+
+
+def test_check_finds_a_clock_and_a_sign_by_the_depth(descent):
+    log, config = descent
+    assert findings(log, config) == {}
+    stream = log[CELLS]
+    late = replace(log, streams={**log.streams, CELLS: replace(stream, time=stream.time + 3.0)})
+    assert "+3.0 s late" in findings(late, config)["lag"]
+    turned = stream.data.copy()
+    turned[:, [NAMES.index(f"adcp_v{axis}") for axis in "xyz"]] *= -1.0
+    away = replace(log, streams={**log.streams, CELLS: replace(stream, data=turned)})
+    assert "-m/s" in findings(away, config)["sign"]
+
+
+@pytest.mark.parametrize("marked", [False, True])
+def test_check_finds_a_bottom_within_the_range_that_nothing_marks(marked):
+    """Echoes of the bottom move over the vehicle as it does: here from the fifth cell on."""
+    rng, t, far = np.random.default_rng(2), np.arange(0.0, 120.0, 2.0), np.arange(2.0, 16.0, 2.0)
+    over = np.column_stack([0.5 + 0.2 * np.sin(0.1 * t), 0.1 * np.cos(0.1 * t), 0.3 * np.cos(0.2 * t)])
+    v = over[:, None] - np.where(far < 10.0, 0.25, 0.0)[None, :, None] * [1.0, 0.0, 0.0]
+    v = (v + rng.normal(0.0, 0.02, v.shape)).reshape(-1, 3)
+    columns = {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")} | {"range": np.tile(far, len(t))}
+    stream = cells(np.repeat(t, len(far)), **columns, **({"bottom": np.full(len(v), 11.0)} if marked else {}))
+    depth = 20.0 + 1.5 * np.sin(0.2 * t)
+    log = Log.from_arrays(time=t, depth=depth, dvl_vx=over[:, 0], dvl_vy=over[:, 1], dvl_vz=over[:, 2])
+    found = findings(log.with_profiles(stream), parse_config(""))
+    assert found == {} if marked else "from 10 m on move as the bottom" in found["bottom"]
