@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rovgraph import smooth
+from rovgraph import Choices, read_log, simulate, smooth
 from rovgraph.diagnosis.check.dvl import profiles
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
@@ -24,7 +24,7 @@ from rovgraph.live.sources.json_lines import JsonRow
 from rovgraph.log import Log, Stream
 from rovgraph.log.companions import usable_cells
 from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
-from rovgraph.model.config import Config, parse_config
+from rovgraph.model.config import Config, mount_matrix, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.calibration_roles import unknowns
@@ -358,3 +358,26 @@ def test_check_finds_a_bottom_within_the_range_that_nothing_marks(marked):
     log = Log.from_arrays(time=t, depth=depth, dvl_vx=over[:, 0], dvl_vy=over[:, 1], dvl_vz=over[:, 2])
     found = findings(log.with_profiles(stream), parse_config(""))
     assert found == {} if marked else "from 10 m on move as the bottom" in found["bottom"]
+
+
+def test_a_simulated_dive_has_profiles_that_smoothing_takes(tmp_path):
+    """By the equation of the estimate: with the true state and current, what is left is the noise of a cell."""
+    made = simulate(
+        "lawnmower", seed=3, choices=Choices(duration=60.0, depth=30.0, dropouts=((10.0, 50.0),), profiles=(4, 9))
+    )
+    made.save(tmp_path / "dive")
+    log = read_log(tmp_path / "dive" / "log.csv")
+    assert set(np.unique(log[CELLS]["adcp_range"])) == set(np.arange(4.0, 40.0, 4.0))
+    world, truth = made.dive.hidden["world"], made.dive.truth
+    config, table = Config(), made.dive.log_frame.dropna(subset=["adcp_vx"])
+    table = table[(table["time"] > 10.0) & (table["time"] < 50.0)]
+    k = np.searchsorted(truth.time, table["time"].to_numpy())
+    R_ns = truth.R_nb[k] @ mount_matrix(config.dvl.mount_rpy_deg)
+    depth = truth.p_n[k, 2] + table["adcp_range"].to_numpy() * R_ns[:, 2, 2]
+    current = np.column_stack([np.interp(depth, world["current_depth"], c) for c in world["current_n"].T])
+    water = truth.v_n[k] - np.column_stack([current, np.zeros(len(k))])
+    off = table[["adcp_vx", "adcp_vy", "adcp_vz"]].to_numpy() - (water[:, None] @ R_ns)[:, 0]
+    assert len(k) == 20 * 9 and np.ptp(current) > 0.2
+    assert np.sqrt(np.mean(off**2, axis=0)) == pytest.approx(config.water.cell_sd_mps, rel=0.5)
+    with pytest.raises(InputError, match="as \\(4, 25\\)"):
+        Choices(profiles=(4, 0))
