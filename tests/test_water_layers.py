@@ -357,7 +357,7 @@ def test_check_finds_a_bottom_within_the_range_that_nothing_marks(marked):
     depth = 20.0 + 1.5 * np.sin(0.2 * t)
     log = Log.from_arrays(time=t, depth=depth, dvl_vx=over[:, 0], dvl_vy=over[:, 1], dvl_vz=over[:, 2])
     found = findings(log.with_profiles(stream), parse_config(""))
-    assert found == {} if marked else "from 10 m on move as the bottom" in found["bottom"]
+    assert found == {} if marked else "from 10 m on move as the bottom" in found[""]
 
 
 def test_a_simulated_dive_has_profiles_that_smoothing_takes(tmp_path):

@@ -149,7 +149,7 @@ def _unmarked(log: Log, cells: Stream, velocity: Array) -> Iterator[Finding]:
     if with_bottom[-1] and not with_bottom[0]:
         first = float(usual.index[len(usual) - int(np.argmin(with_bottom[::-1]))])
         text = f"cells from {first:g} m on move as the bottom does, which is within their range and not marked"
-        yield Finding(CELLS, "warning", f"{text}: give the column bottom, or dvl_altitude", "bottom")
+        yield Finding(CELLS, "warning", f"{text}: give the column bottom, or dvl_altitude")
 
 
 def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
