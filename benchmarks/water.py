@@ -129,6 +129,7 @@ ROWS = {
     "sd of cells stated a fifth": Row(Setting(stated=0.2)),
     "no layers": Row(Setting(None)),
     "cliff": Row(Setting(surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
+    "cliff, 600 kHz": Row(Setting(WORKHORSE_600, surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
     "cliff, restless": Row(Setting(surface_s=120.0, depth=60.0, cliff=True, fast=0.04), None, 2.0),
     "cliff, no layers": Row(Setting(None, surface_s=120.0, depth=60.0, cliff=True)),
 }
