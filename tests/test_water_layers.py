@@ -304,6 +304,7 @@ def test_a_dive_online_knows_the_current_as_its_filter_does(descent):
     assert [at.depth for at in last.current] == [100.0, 110.0, 120.0, 130.0]
     assert json.loads(json_line(last))["current"][0]["depth"] == 100.0
     assert not any("layer" in label for label in last.calibration)
+    assert last.sensors[CELLS].used > 200  # rows that its profiles became
 
 
 def test_profiles_that_a_section_states_may_begin_later(descent):
