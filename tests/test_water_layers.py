@@ -216,6 +216,19 @@ def descent() -> tuple[Log, Config]:
     return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
 
 
+def test_water_track_is_not_used_beside_the_profiles_that_it_is_a_mean_of(descent):
+    log, config = descent
+    track = replace(log["dvl"], sensor="dvl_water", data=log["dvl"].data[:, :3])
+    both = replace(log, streams={**log.streams, "dvl_water": track})
+    initial = initialise(both, config)
+    assert WATER_LAYER in initial.instruments and "dvl_water" not in initial.instruments
+    assert any(line.startswith("dvl_water is left out") for line in initial.assumptions)
+    assert (
+        "dvl_water"
+        in initialise(replace(both, streams={**both.streams, CELLS: log[CELLS].take([])}), config).instruments
+    )
+
+
 def test_gtsam_and_isam2_refuse_layers_in_one_line(descent):
     pytest.importorskip("gtsam")
     from rovgraph.inference.graph.batch import refuse_layers

@@ -498,10 +498,13 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
         knots, spacing = config.water.knots, config.water.knot_m
         said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
         assumptions.append(f"profiles of the water are used; the current: {said}")
+        if "dvl_water" in log:
+            assumptions.append("dvl_water is left out: it is a mean of the cells of the profiles")
     assumptions += [why_not] if why_not else []
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams, *layers}
+    present -= {"dvl_water"} if layers else set()
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = _resolve_sound(log, config, assumptions)
     config = with_priors_stated(config, compass)

@@ -21,7 +21,7 @@ from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, label_number, precedence
-from rovgraph.model.calibration import ACOUSTICS
+from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
@@ -333,7 +333,8 @@ ANYWHERE_M = 1e4  # sd of the start of a dive without a fix
 
 def is_late(m: Measurement, engine: FixedLag) -> bool:
     """Whether a measurement is of a sensor that the configuration has and the filter does not."""
-    if m.sensor not in LATE or m.sensor in engine.initial.instruments:
+    used = engine.initial.instruments
+    if m.sensor not in LATE or m.sensor in used or (m.sensor == "dvl_water" and WATER_LAYER in used):
         return False
     return m.sensor != "thruster" or engine.initial.config.graph.hydrodynamics
 
