@@ -62,12 +62,16 @@ def pd0_ensemble(
     bottom: bool = True,
     date: Sequence[int] | None = None,
     more: Sequence[bytes] = (),
+    profile: Sequence[Sequence[float]] = (),
 ) -> bytes:
     """An ensemble, its velocities those of the bottom [m/s]; roll, pitch, heading [rad], bias and alignment [deg].
 
-    ``more`` are other records.
+    ``more`` are other records, ``profile`` velocities of the water in cells of 4 m, the first one at 6.5 m [m/s].
     """
+    cells = struct.pack("<H", 0x0100) + b"".join(struct.pack("<4h", *in_mm(cell)) for cell in profile)
     fixed = bytearray(59)
+    struct.pack_into("<B2xH", fixed, 9, len(profile), 400)
+    struct.pack_into("<H", fixed, 32, 650)
     struct.pack_into("<HBBHxxB", fixed, 0, 0x0000, 50, 40, 0x4249 | (0x80 if up else 0) | 0x08, 4)
     struct.pack_into("<BhhB", fixed, 25, (system << 3) | 0b111, round(100 * alignment), round(100 * bias), source)
     fixed[58] = 30
@@ -83,9 +87,7 @@ def pd0_ensemble(
     struct.pack_into("<12B", track, 32, *[heard] * 4, *[80] * 4, *[100] * 4)
     struct.pack_into("<4h", track, 50, *in_mm(water))
     struct.pack_into("<4B", track, 77, *(r >> 16 for r in far))
-    return ensemble(
-        bytes(fixed), bytes(variable), struct.pack("<H8h", 0x0100, *range(8)), *[bytes(track)] * bottom, *more
-    )
+    return ensemble(bytes(fixed), bytes(variable), cells, *[bytes(track)] * bottom, *more)
 
 
 def winriver_gga(clock: str, before: float, lat: float, lon: float, quality: int = 2, hdop: float = 0.9) -> bytes:
@@ -206,6 +208,17 @@ def signature_record(stamp: float, beams: Sequence[int], system: int = 2, heard:
     far = [2500] * 4 if heard else [-1022] * 4
     data = struct.pack("<4i4i4H", *beams, *far, *[3 if heard else 65535] * 4)
     return nortek_record(0x17, 0x10, bytes(head) + data)
+
+
+def profile_record(stamp: float, values: np.ndarray, system: int, beams: int = 4) -> bytes:
+    """Average of a profile by a Signature, cells of 2 m after 0.5 m, shape (cells, 4); roll 3, pitch -2, heading 90."""
+    head = bytearray(76)
+    struct.pack_into("<BBHI6BH", head, 0, 3, 76, 0x20, 7, *_nortek_date(stamp), round(1e4 * (stamp % 1.0)))
+    packed = beams << 12 | system << 10 | len(values)
+    struct.pack_into("<HhIHhhHHH", head, 16, 15000, 1000, 5000, 9000, -200, 300, packed, 2000, 50)
+    struct.pack_into("<b9xI", head, 58, -3, 0b10)
+    raw = np.where(np.isfinite(values), np.round(1000.0 * np.nan_to_num(values)), BAD).astype("<i2")
+    return nortek_record(0x16, 0x10, bytes(head) + raw.T.tobytes())
 
 
 def nucleus_record(kind: int, stamp: float, values: Sequence[float], status: int = 0xFFFF, posix: bool = True) -> bytes:

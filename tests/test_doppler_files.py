@@ -1,6 +1,7 @@
 """Native files of Doppler instruments: Teledyne PD0, PD4, PD5, PD6, Nortek AD2CP, DVL and Nucleus."""
 
 import gzip
+import struct
 import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -22,6 +23,7 @@ from doppler_files import (
     pd0_ensemble,
     pd4_frame,
     pd6_ping,
+    profile_record,
     signature_record,
     trdi_values,
     vmdas_navigation,
@@ -36,6 +38,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 from wire import sentence
 
+from rovgraph import read_log
 from rovgraph.api.conversion import convert
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import matrix_from_rpy
@@ -102,6 +105,86 @@ def test_a_simulated_dive_comes_back_of_pd0_from_all_coordinates_within_its_reso
     heading = first(recording, "vehicle_heading" if system == SHIP else "dvl_heading").columns
     np.testing.assert_allclose(heading["heading" if system == SHIP else "dvl_heading"], rpy[:, 2], atol=1e-4)
     np.testing.assert_allclose(first(recording, "dvl_altitude").columns["dvl_altitude"], 3.0)
+
+
+@pytest.mark.parametrize(("system", "up"), WAYS)
+def test_cells_of_a_profile_are_velocities_relative_to_the_water_at_their_own_depths(system, up, tmp_path):
+    rpy, printed = np.array([0.1, 0.2, 0.7]), np.array([0.1, 0.2, 0.7])
+    rpy[1] = np.arctan(np.tan(rpy[1]) * np.cos(rpy[0]))
+    relative = np.column_stack([0.5 - 0.02 * np.arange(6), 0.03 * np.arange(6), np.full(6, 0.2)])
+    cells = [-trdi_values(v, system, rpy, up) for v in relative]
+    cells[2], cells[4] = [np.nan] * 4, [0.0] * 4  # the instrument marks the one so, an older one the other
+    data = b"".join(
+        pd0_ensemble(UNIX + k, system=system, rpy=printed + k * 1e-3, up=up, profile=cells, ranges=(70, 60, 80, 0))
+        for k in range(2)
+    )
+    recording = read(data, tmp_path)
+    table = recording.tables["adcp"]
+    beams = system == BEAM and not up
+    level = np.cos(rpy[0]) * np.cos(rpy[1]) if system >= SHIP else 1.0  # depths of bins that it has mapped
+    here = table["time"] < UNIX + 0.5
+    close(table["range"][here] * level, 6.5 + 4.0 * np.array([0, 1, 3, 5]), 5e-4)
+    close(table["cell"][here] * level, np.full(4, 4.0), 5e-4)
+    close(table["bottom"], np.full(8, 60.0))
+    close(np.column_stack([table["roll"], table["pitch"]])[here], np.tile(rpy[:2], (4, 1)), 1e-4)
+    assert recording.settings["water"] == {"beam_angle_deg": 30.0} | ({"looks": "up"} if up else {})
+    if beams:
+        assert recording.settings["dvl"]["beams"] == {"angle_deg": 30.0, "azimuth_deg": [270.0, 90.0, 0.0, 180.0]}
+        head = beam_geometry(parse_config("dvl: {beams: {angle_deg: 30, azimuth_deg: [270, 90, 0, 180]}}").dvl)
+        along = np.column_stack([table[f"beam_{k}"] for k in range(1, 5)])
+        found = velocity_by_beams(head.directions, along, np.isfinite(along))[0]
+    else:
+        found = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    close(found[here], relative[[0, 1, 3, 5]], 0.0012)
+
+
+def test_profiles_stay_beside_a_log_that_is_converted_again(tmp_path):
+    cells = [(0.1, 0.2, 0.03, 0.0), (0.1, 0.25, 0.03, 0.0)]
+    pd0, log, again = (tmp_path / name for name in ("dive.pd0", "log.csv", "again.csv"))
+    pd0.write_bytes(b"".join(pd0_ensemble(UNIX + k, source=1, profile=cells) for k in range(5)))
+    with pytest.warns(DataWarning, match="nothing measured it"):
+        made = convert([pd0])
+    made.save(log)
+    convert([log]).save(again)
+    for read_back in (made.log["adcp"], read_log(log)["adcp"], read_log(again)["adcp"]):
+        close(read_back["adcp_vx"], np.tile([-0.2, -0.25], 5))
+        close(read_back["adcp_range"], np.tile([6.5, 10.5], 5))
+        close(read_back.time - read_back.time[0], np.repeat(np.arange(5.0), 2), 0.006)
+
+
+def test_of_two_profilers_in_one_file_the_one_that_looks_down_is_kept(tmp_path):
+    cells = [(0.1, 0.2, 0.3, 0.0)] * 3
+    data = b"".join(pd0_ensemble(UNIX + k, up=k % 2 == 0, profile=cells) for k in range(5))
+    recording = read(data, tmp_path)
+    close(np.unique(recording.tables["adcp"]["time"]), UNIX + np.array([1.0, 3.0]), 0.006)
+    assert [(each.name, each.count) for each in recording.left if each.reason == "looks the other way"] == [
+        ("profile", 3)
+    ]
+
+
+def test_the_error_velocity_shows_the_noise_of_a_cell(tmp_path):
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0.0, [[0.02], [0.06]], (800, 2, 4))
+    data = b"".join(pd0_ensemble(UNIX + k, profile=profile) for k, profile in enumerate(noise))
+    sd = read(data, tmp_path).tables["adcp"]["sd"]  # of ten groups
+    np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.02, 0.06], rtol=0.1)
+    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [75, 60, 110, 110])
+    data = b"".join(pd0_ensemble(UNIX + k, profile=profile[::-1], more=[of_beams]) for k, profile in enumerate(noise))
+    sd = read(data, tmp_path).tables["adcp"]["sd"]  # by the third best correlation, whatever the cell's number
+    np.testing.assert_allclose([np.mean(sd[::2]), np.mean(sd[1::2])], [0.06, 0.02], rtol=0.1)
+
+
+def test_cells_of_three_beams_or_low_correlation_are_left_out_where_others_are_better(tmp_path):
+    four, three = (0.1, 0.2, 0.03, 0.01), (0.1, 0.2, 0.03, np.nan)
+    recording = read(b"".join(pd0_ensemble(UNIX + k, profile=[four, four, three]) for k in range(4)), tmp_path)
+    assert np.all(recording.tables["adcp"]["range"] < 11.0)
+    assert any(each.name == "cell" and each.count == 4 for each in recording.left)
+    of_beams = struct.pack("<H", 0x0200) + bytes([120] * 4 + [63, 60, 110, 110])
+    faint = read(b"".join(pd0_ensemble(UNIX + k, profile=[four, four], more=[of_beams]) for k in range(4)), tmp_path)
+    assert len(faint.tables["adcp"]["time"]) == 4
+    assert any(each.reason == "low correlation" and each.count == 4 for each in faint.left)
+    every = read(b"".join(pd0_ensemble(UNIX + k, profile=[three]) for k in range(4)), tmp_path)
+    assert len(every.tables["adcp"]["time"]) == 4
 
 
 def test_ensembles_of_two_coordinate_systems_in_one_file_agree(tmp_path):
@@ -389,6 +472,42 @@ def test_a_remus_dive_keeps_its_attitude_in_its_own_axes():
     assert np.std((descent - below)[steep]) < 0.5 * np.std((descent - moved[:, 2])[steep])  # if they were level
 
 
+def test_a_remus_profile_agrees_with_an_independent_decoding():
+    table = real("remus600_pd0/adcp_auv_51.pd0").tables["adcp"]
+    expected = YAML(typ="safe").load((DATA / "remus600_pd0" / "adcp_auv_51.expected.yml").read_text())["data"]
+    profiles = [one for one in expected if one["particle_type"] == "adcp_velocity_earth"]
+    down = [one for one in profiles if one["sysconfig_vertical_orientation"] == 0]
+    names = "water_velocity_north", "water_velocity_east", "water_velocity_up"  # in this file ahead, right, up
+    ahead, right, up = (np.concatenate([one[name] for one in down]).astype(float) for name in names)
+    heard = np.concatenate([one["error_velocity"] for one in down]) != -32768  # of four beams
+    close(table["vx"], -1e-3 * ahead[heard], 1e-9)
+    close(table["vy"], -1e-3 * right[heard], 1e-9)
+    close(table["vz"], 1e-3 * up[heard], 1e-9)
+    first = np.concatenate([0.01 * (one["bin_1_distance"] + one["cell_length"] * np.arange(8)) for one in down])
+    close(table["range"], first[heard], 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "fastest", "scatter"),
+    [("remus600_pd0/adcp.adc.gz", 1.0, 0.12), ("glider_pd0/ooi_glider_NE051400.PD0", 0.05, 0.12)],
+)
+def test_the_water_stands_still_beside_the_bottom_whichever_way_a_vehicle_goes(name, fastest, scatter):
+    """Current = velocity over the bottom less that relative to the cells, in Earth axes."""
+    recording = real(name)
+    table, heading = recording.tables["adcp"], next(c for c in recording.channels if c.sensor.endswith("heading"))
+    over, pings = velocity(recording), first(recording, "dvl").columns["time"]
+    ping = np.searchsorted(pings, table["time"])
+    azimuth = np.unwrap(heading.columns[heading.sensor.replace("vehicle_", "")])
+    rpy = np.column_stack([table["roll"], table["pitch"], np.interp(table["time"], heading.columns["time"], azimuth)])
+    R_ns = matrix_from_rpy(rpy)
+    relative = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    known = np.isfinite(over[ping]).all(axis=1) & (table["range"] < 0.8 * np.nan_to_num(table["bottom"]))
+    moved, current = (np.einsum("nij,nj->ni", R_ns, v)[known, :2] for v in (over[ping], over[ping] - relative))
+    assert len(current) > 700 and np.median(np.abs(moved)) > fastest
+    assert 1.48 * np.median(np.abs(current - np.median(current, axis=0))) < scatter
+    assert np.all(np.abs(np.median(current, axis=0)) < 0.2)
+
+
 def test_a_gliders_corrupt_file_gives_its_good_ensembles():
     recording = real("glider_pd0/ooi_glider_LB180210_3_corrupted.PD0")
     assert len(first(recording, "depth").columns["time"]) == 2
@@ -450,6 +569,50 @@ def test_a_signatures_profile_is_that_of_its_beams_by_the_makers_own_matrix():
     preset = parse_config("dvl: {preset: nortek-signature}").dvl
     found, _ = velocity_by_beams(beam_geometry(preset).directions, away, np.isfinite(away))
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-4)  # the matrix has five digits
+
+
+def test_an_ad2cp_profile_agrees_with_its_makers_own_decoding():
+    table = real("adcp_bt/VelEchoBT01.ad2cp.gz").tables["adcp"]
+    with gzip.open(DATA / "adcp_bt" / "VelEchoBT01.mat.gz") as file:
+        made = loadmat(file, simplify_cells=True)
+    for k in (1, 2, 3, 4):
+        close(table[f"beam_{k}"], -made["Data"][f"Burst_VelBeam{k}"].ravel().astype(float), 1e-6)
+    blank, cell = made["Config"]["Burst_BlankingDistance"], made["Config"]["Burst_CellSize"]
+    close(table["range"], np.tile(blank + cell * np.arange(1, 31), 160), 1e-6)
+    assert "vx" not in table and np.all(table["cell"] == cell)
+
+
+@pytest.mark.parametrize("system", [0, 1, 2])
+def test_cells_of_a_nortek_profile_are_relative_to_the_water_in_all_coordinates(system, tmp_path):
+    rpy = np.deg2rad([3.0, -2.0, 90.0])  # of `profile_record`, which looks up: X forward, Y to port, Z up
+    relative = np.column_stack([0.5 - 0.1 * np.arange(3), 0.1 * np.arange(3), np.full(3, -0.05)])
+    R = Rotation.from_euler("ZYX", [np.pi / 2 - rpy[2], -rpy[1], rpy[0]])  # from there to east, north, up
+    cells = -R.apply(relative) if system == 0 else -relative
+    if system == 2:
+        head = beam_geometry(parse_config("dvl: {preset: nortek-signature}").dvl)
+        values = cells @ head.directions.T
+    else:
+        values = np.column_stack([cells, cells[:, 2]])
+    values[1] = np.nan
+    data = b"".join(profile_record(UNIX + k, values, system) for k in range(3))
+    recording = read(data, tmp_path)
+    table = recording.tables["adcp"]
+    close(table["range"], np.tile([0.5 + 2.0, 0.5 + 6.0], 3))
+    if system == 2:
+        along = np.column_stack([table[f"beam_{k}"] for k in range(1, 5)])
+        found = velocity_by_beams(head.directions, along, np.isfinite(along))[0]
+        assert recording.settings["dvl"]["beams"]["angle_deg"] == 25.0
+    else:
+        found = np.column_stack([table[f"v{axis}"] for axis in "xyz"])
+    close(found, np.tile(relative[[0, 2]], (3, 1)), 0.002)
+    assert sensors(recording) >= {"depth", "dvl_heading", "vehicle_tilt"}  # without bottom track, of its records
+
+
+def test_a_nortek_profile_of_other_beams_is_counted_and_left_out(tmp_path):
+    track, odd = signature_record(UNIX, [100] * 4), profile_record(UNIX, np.zeros((3, 4)), 2, beams=3)
+    recording = read(track + odd, tmp_path)
+    assert "adcp" not in recording.tables
+    assert any(each.count == 1 and "four beams" in each.reason for each in recording.left)
 
 
 def solved(name: str) -> tuple[Log, np.ndarray]:

@@ -1,12 +1,17 @@
 """Profiles of the water: what becomes of their cells, and that chain, filter and live dives know the current alike."""
 
+import json
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from rovgraph import Choices, read_log, simulate, smooth
+from rovgraph.diagnosis.check.dvl import profiles
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
@@ -14,14 +19,17 @@ from rovgraph.inference.initialise import initialise
 from rovgraph.inference.smoother import assemble
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import FIRST_KNOT
+from rovgraph.live.outputs.json_lines import json_line
+from rovgraph.live.sources.json_lines import JsonRow
 from rovgraph.log import Log, Stream
 from rovgraph.log.companions import usable_cells
 from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
-from rovgraph.model.config import Config, parse_config
+from rovgraph.model.config import Config, mount_matrix, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.calibration_roles import unknowns
-from rovgraph.problem.layers import WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.problem.layers import UNLIKE, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
+from rovgraph.readers.records import Refused
 from rovgraph.sensors.dvl import DvlVelocity
 from rovgraph.sensors.dvl_beam import beam_geometry
 from rovgraph.sensors.water_layer import ADCP, CELLS, WaterLayer
@@ -57,7 +65,7 @@ def context(rows: Stream) -> Array:
 def test_rows_of_a_profile_hold_all_that_its_cells_say():
     """Least squares by the rows and by the cells themselves give the same velocities and covariance."""
     rng = np.random.default_rng(1)
-    far, v = np.arange(3.0, 43.0, 4.0), rng.normal(0.0, 0.3, (10, 3))
+    far, v = np.arange(3.0, 43.0, 4.0), rng.normal(0.0, [0.3, 0.3, 0.02], (10, 3))
     sd = rng.uniform(0.03, 0.1, 10)
     made = layers("water: {knots: 8, cell_correlation: 0}")
     rows = made.of(cells(10.0, range=far, vx=v[:, 0], vy=v[:, 1], vz=v[:, 2], sd=sd), LEVEL, None, Counter())
@@ -103,6 +111,20 @@ def test_a_bottom_that_the_table_does_not_mark_is_known_by_the_altitude():
     far, zero, left = np.arange(2.0, 30.0, 3.0), np.zeros(10), Counter()
     layers("water: {knots: 8}", altitude=15.0).of(cells(10.0, range=far, vx=zero, vy=zero, vz=zero), LEVEL, None, left)
     assert sum(left.values()) == np.count_nonzero(far > 15.0 * np.cos(np.pi / 6))
+
+
+def test_cells_that_rise_or_sink_unlike_those_beside_them_are_left_out():
+    """As the last ones of a real profile do, where echoes are faint; on a tilted head too."""
+    rpy = np.array([0.1, -0.4, 0.0])
+    v_n = np.tile([0.3, -0.2, 0.5], (9, 1))
+    v_n[:, 0] += 0.05 * np.arange(9)
+    v_n[[3, 8], 2] += 0.2
+    v = v_n @ matrix_from_rpy(rpy)
+    by, left = {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")}, Counter()
+    layers("water: {knots: 8}").of(
+        cells(10.0, range=np.arange(2.0, 20.0, 2.0), roll=rpy[0], pitch=rpy[1], **by), LEVEL, None, left
+    )
+    assert +left == {(CELLS, UNLIKE): 2}
 
 
 def test_beams_of_a_tilted_head_are_taken_at_the_depth_of_the_cell():
@@ -187,11 +209,24 @@ def descent() -> tuple[Log, Config]:
     from fault_campaign.instruments import log_table
     from fault_campaign.water import Profiler
 
-    setting = water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0, knots=4)
-    dive, table = water.make_dive(setting, 1)
+    dive, table = water.make_dive(water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0), 1)
+    dive.configuration["water"]["knots"] = 4
     config = Config.model_validate(dive.configuration)
     log = Log.from_frame(log_table(dive.streams), config)
     return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
+
+
+def test_water_track_is_not_used_beside_the_profiles_that_it_is_a_mean_of(descent):
+    log, config = descent
+    track = replace(log["dvl"], sensor="dvl_water", data=log["dvl"].data[:, :3])
+    both = replace(log, streams={**log.streams, "dvl_water": track})
+    initial = initialise(both, config)
+    assert WATER_LAYER in initial.instruments and "dvl_water" not in initial.instruments
+    assert any(line.startswith("dvl_water is left out") for line in initial.assumptions)
+    assert (
+        "dvl_water"
+        in initialise(replace(both, streams={**both.streams, CELLS: log[CELLS].take([])}), config).instruments
+    )
 
 
 def test_gtsam_and_isam2_refuse_layers_in_one_line(descent):
@@ -248,3 +283,115 @@ def test_with_one_knot_a_layer_has_the_equation_of_water_track():
     assert layer[1].keys() == track[1].keys()
     for name, by in track[1].items():
         np.testing.assert_array_equal(layer[1][name], by)
+
+
+def test_the_current_of_a_dive_is_what_it_was_and_is_in_its_results(descent, tmp_path):
+    """At the depths of its knots, within their sds; the page draws it."""
+    from fault_campaign.water import draw
+
+    from rovgraph.report.pages.dive import dive_section
+    from rovgraph.report.pages.source import DiveSource
+
+    log, config = descent
+    done = smooth(log, config)
+    found = done.main.current
+    true = draw(np.random.default_rng([29, 1]), 250.0).at(found["depth"].to_numpy(), found["time"].to_numpy())
+    off = (found[["north", "east"]].to_numpy() - true) / found[["north_sd", "east_sd"]].to_numpy()
+    assert len(found) > 50 and set(np.diff(np.unique(found["depth"]))) == {10.0}
+    assert np.abs(off).max() < 4.0 and 0.3 < np.sqrt(np.mean(off**2)) < 1.6
+    source = DiveSource(tmp_path / "out", done.save(tmp_path / "out", figures=False, page=False))
+    panels = {item.title: item for item in dive_section(source).items}
+    assert len(panels["Current north"].traces[0]["marker"]["color"]) == len(found)
+
+
+def test_a_dive_online_knows_the_current_as_its_filter_does(descent):
+    from live import flown
+
+    log, config = descent
+    solutions = flown(SimpleNamespace(log=log, config=config), rate=1.0).solutions
+    filtered = smooth(log, config, "filtered").main.trajectory
+    last = solutions[-1]
+    k = int(np.abs(filtered.time - last.time).argmin())
+    np.testing.assert_allclose(last.position, filtered.p_n[k], atol=0.05 * last.position_sd[0])
+    np.testing.assert_allclose(last.position_sd, np.sqrt(np.diag(filtered.cov_p[k])), rtol=0.05)
+    assert [at.depth for at in last.current] == [100.0, 110.0, 120.0, 130.0]
+    assert json.loads(json_line(last))["current"][0]["depth"] == 100.0
+    assert not any("layer" in label for label in last.calibration)
+    assert last.sensors[CELLS].used > 200  # rows that its profiles became
+
+
+def test_profiles_that_a_section_states_may_begin_later(descent):
+    from live import flown
+
+    log, config = descent
+    late = replace(log, streams={**log.streams, CELLS: log[CELLS].take(log[CELLS].time > 20.0)})
+    late = replace(late, streams={name: s.take(s.time < 30.0) for name, s in late.streams.items()})
+    assert flown(SimpleNamespace(log=late, config=config), rate=1.0).solutions[-1].current
+    unstated = config.model_copy(update={"water": Config().water})
+    assert not flown(SimpleNamespace(log=late, config=unstated), rate=1.0).solutions[-1].current
+
+
+def test_a_json_line_may_hold_a_profile():
+    row = JsonRow("-", lambda *_, **__: None, parse_config("units: {adcp_velocity: -mm/s}"))
+    profile = [{"range": 4.0, "vx": 100, "vy": 0, "vz": -20}, {"range": 8.0, "vx": 120, "vy": None, "vz": 0}]
+    message = row.message(json.dumps({"time": 7.0, "depth": 3.0, "adcp": profile}).encode(), 0.0)
+    assert [reading.sensor for reading in message.readings] == ["depth", CELLS, CELLS]
+    first = dict(zip(NAMES, message.readings[1].values, strict=True))
+    assert message.stamp == 7.0 and first["adcp_range"] == 4.0
+    assert first["adcp_vx"] == pytest.approx(-0.1) and first["adcp_vz"] == pytest.approx(0.02)
+    with pytest.raises(Refused, match="expected a list of cells"):
+        row.message(b'{"time": 7.0, "adcp": 3}', 0.0)
+
+
+def findings(log: Log, config: Config) -> dict[str, str]:
+    return {f.kind: f.text for f in profiles(log, config) if f.level == "warning"}
+
+
+def test_check_finds_a_clock_and_a_sign_by_the_depth(descent):
+    log, config = descent
+    assert findings(log, config) == {}
+    stream = log[CELLS]
+    late = replace(log, streams={**log.streams, CELLS: replace(stream, time=stream.time + 3.0)})
+    assert "+3.0 s late" in findings(late, config)["lag"]
+    turned = stream.data.copy()
+    turned[:, [NAMES.index(f"adcp_v{axis}") for axis in "xyz"]] *= -1.0
+    away = replace(log, streams={**log.streams, CELLS: replace(stream, data=turned)})
+    assert "-m/s" in findings(away, config)["sign"]
+
+
+@pytest.mark.parametrize("marked", [False, True])
+def test_check_finds_a_bottom_within_the_range_that_nothing_marks(marked):
+    """Echoes of the bottom move over the vehicle as it does: here from the fifth cell on."""
+    rng, t, far = np.random.default_rng(2), np.arange(0.0, 120.0, 2.0), np.arange(2.0, 16.0, 2.0)
+    over = np.column_stack([0.5 + 0.2 * np.sin(0.1 * t), 0.1 * np.cos(0.1 * t), 0.3 * np.cos(0.2 * t)])
+    v = over[:, None] - np.where(far < 10.0, 0.25, 0.0)[None, :, None] * [1.0, 0.0, 0.0]
+    v = (v + rng.normal(0.0, 0.02, v.shape)).reshape(-1, 3)
+    columns = {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")} | {"range": np.tile(far, len(t))}
+    stream = cells(np.repeat(t, len(far)), **columns, **({"bottom": np.full(len(v), 11.0)} if marked else {}))
+    depth = 20.0 + 1.5 * np.sin(0.2 * t)
+    log = Log.from_arrays(time=t, depth=depth, dvl_vx=over[:, 0], dvl_vy=over[:, 1], dvl_vz=over[:, 2])
+    found = findings(log.with_profiles(stream), parse_config(""))
+    assert found == {} if marked else "from 10 m on move as the bottom" in found[""]
+
+
+def test_a_simulated_dive_has_profiles_that_smoothing_takes(tmp_path):
+    """By the equation of the estimate: with the true state and current, what is left is the noise of a cell."""
+    made = simulate(
+        "lawnmower", seed=3, choices=Choices(duration=60.0, depth=30.0, dropouts=((10.0, 50.0),), profiles=(4, 9))
+    )
+    made.save(tmp_path / "dive")
+    log = read_log(tmp_path / "dive" / "log.csv")
+    assert set(np.unique(log[CELLS]["adcp_range"])) == set(np.arange(4.0, 40.0, 4.0))
+    world, truth = made.dive.hidden["world"], made.dive.truth
+    config, table = Config(), made.dive.log_frame.dropna(subset=["adcp_vx"])
+    table = table[(table["time"] > 10.0) & (table["time"] < 50.0)]
+    k = np.searchsorted(truth.time, table["time"].to_numpy())
+    R_ns = truth.R_nb[k] @ mount_matrix(config.dvl.mount_rpy_deg)
+    depth = truth.p_n[k, 2] + table["adcp_range"].to_numpy() * R_ns[:, 2, 2]
+    current = np.column_stack([np.interp(depth, world["current_depth"], c) for c in world["current_n"].T])
+    water = truth.v_n[k] - np.column_stack([current, np.zeros(len(k))])
+    off = table[["adcp_vx", "adcp_vy", "adcp_vz"]].to_numpy() - (water[:, None] @ R_ns)[:, 0]
+    assert len(k) == 20 * 9 and np.ptp(current) > 0.2
+    assert np.sqrt(np.mean(off**2, axis=0)) == pytest.approx(config.water.cell_sd_mps, rel=0.5)
+    with pytest.raises(InputError, match="as \\(4, 25\\)"):
+        Choices(profiles=(4, 0))

@@ -13,7 +13,7 @@ from typing import Any
 
 from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
 from rovgraph.log import Log
-from rovgraph.log.companions import usable_beams
+from rovgraph.log.companions import usable_beams, usable_cells
 from rovgraph.log.tables import names_of, read_table, table_beside
 from rovgraph.log.units import groups, nearest, quantities
 from rovgraph.model.config import (
@@ -43,6 +43,7 @@ from rovgraph.readers.own_log import FORMAT as OWN_LOG
 from rovgraph.readers.own_log import NOTHING, Paths, is_plain_log, once
 from rovgraph.readers.recording import Recording, SourceMissing, earlier
 from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.water_layer import CELLS
 
 REPORT = ".report.json"
 
@@ -81,12 +82,11 @@ class Conversion:
         """
         merged, source = self.merged, self.merged.source
         with collected_warnings() as texts:
-            beams = (
-                usable_beams(merged.tables[BEAMS], self.config, f"beams of {source}")
-                if BEAMS in merged.tables
-                else None
+            beams, cells = (
+                usable(merged.tables[name], self.config, f"{what} of {source}") if name in merged.tables else None
+                for name, usable, what in ((BEAMS, usable_beams, "beams"), (CELLS, usable_cells, "profiles"))
             )
-        log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
+        log = Log.from_rows(merged.rows, self.config, source).with_beams(beams).with_profiles(cells)
         return replace(
             log,
             config=self.completed,

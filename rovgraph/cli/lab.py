@@ -68,6 +68,9 @@ def simulate(
             help="a place that a camera recognises, in m, such as 10:-5; may be repeated", metavar="NORTH:EAST"
         ),
     ] = None,
+    profiles: Annotated[
+        str | None, typer.Option(help="an ADCP's cells, length in m and number, such as 4:25", metavar="LENGTH:NUMBER")
+    ] = None,
     false_places: Annotated[float, typer.Option(help="share of the camera's matches that are false, below 1")] = 0.0,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="noise, biases and drawn calibration")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
@@ -96,6 +99,7 @@ def simulate(
         dropouts=tuple(_pair(text) for text in dropout or ()),
         places=tuple(_pair(text) for text in place or ()),
         false_places=false_places,
+        profiles=None if profiles is None else _pair(profiles),
         noise=noise,
     )
     dive = rg.simulate(scenario, given, seed, choices)

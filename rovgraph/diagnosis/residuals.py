@@ -20,6 +20,7 @@ from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.model.config import Config
+from rovgraph.problem.layers import SIDE_LOBES
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.rules import CHANCE, RULES, USUAL_SHARE, Severity
 from rovgraph.sensors.instruments import HEADING_STREAMS
@@ -29,7 +30,7 @@ GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a mi
 IN_A_ROW, SCATTERED = 3, 0.25  # from which on rejections follow each other; up to which share others count for nothing
 IN_A_MINUTE = 1.5  # times as much
 OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
-REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are normal, or have a rule
+REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen", SIDE_LOBES)  # reasons that are normal, or have a rule
 LASTING_S = (5.0, 20.0)  # over which errors last, unlike noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {

@@ -20,6 +20,7 @@ from rovgraph.inference.estimate import (
     body_trajectory,
     calibration_estimates,
     calibration_history,
+    current_frame,
     reply_frame,
     residual_frame,
 )
@@ -40,7 +41,7 @@ from rovgraph.inference.remembered_places import RememberedPlace, columns, commo
 from rovgraph.inference.smoother import optimum
 from rovgraph.kernels.measurement_row import TIME
 from rovgraph.log import Log, Measurement
-from rovgraph.model.calibration import ACOUSTICS
+from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -152,7 +153,11 @@ class FilterHistory:
         replies = reply_frame(
             ((s, engine.measurements(problem, problem.of_sensor(s))) for s in acoustic), engine.initial.config
         )
-        return Estimate(kind, trajectory, calibration, history, residuals, self._summary(problem), replies=replies)
+        layers = engine.measurements(problem, problem.of_sensor(WATER_LAYER)) if WATER_LAYER in problem.used else None
+        current = current_frame(history, layers, engine.initial.config.water.knot_m)
+        return Estimate(
+            kind, trajectory, calibration, history, residuals, self._summary(problem), replies=replies, current=current
+        )
 
     def _measured(self, problem: Problem, smoothed: State | None) -> Iterator[tuple[str, Measurements, State, Array]]:
         """Each sensor's measurements, the states they are compared with, and their weights."""

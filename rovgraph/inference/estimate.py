@@ -17,16 +17,19 @@ from rovgraph.inference.posterior import POSITION, ROTATION, Posterior, displace
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import RATE_B, SPREAD, TIME
-from rovgraph.model.calibration import CONSIDERED, LAYOUT, TABLE, Belief, beacon_names
+from rovgraph.model.calibration import CONSIDERED, LAYERS, LAYOUT, TABLE, Belief, beacon_names
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.model.state import State
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
-from rovgraph.sensors import AcousticExchange, innovation
+from rovgraph.sensors import AcousticExchange, WaterLayer, innovation
+from rovgraph.sensors.sensor import LARGEST_SD
 
 RESIDUAL_COLUMNS = [
     "time", "sensor", "component", "measured", "predicted", "innovation", "sd", "normalised", "weight", "row",
 ]  # fmt: skip
+CURRENT_COLUMNS = ["time", "depth", "north", "east", "north_sd", "east_sd"]
+CURRENT_S = 10.0  # between profiles whose current is kept
 REPLY_COLUMNS = [
     "time", "sensor", "beacon", "ship_north", "ship_east", "ship_heading", "range", "bearing", "elevation", "row",
 ]  # fmt: skip
@@ -128,6 +131,7 @@ class Estimate:
     summary : numbers about the solution, ready for JSON
     posterior : of a smoothed estimate of the chain: what `covariance`, `joint`, `relative` and `sample` come from
     replies : columns `REPLY_COLUMNS`, of each acoustic measurement, as `reply_frame` has them
+    current : columns `CURRENT_COLUMNS`, of the water at its knots, as `current_frame` has them
     """
 
     kind: str
@@ -138,6 +142,7 @@ class Estimate:
     summary: dict[str, Any] = field(default_factory=dict)
     posterior: Posterior | None = field(default=None, compare=False)
     replies: pd.DataFrame = field(default_factory=lambda: reply_frame(()), compare=False)
+    current: pd.DataFrame = field(default_factory=lambda: current_frame({}, None, 1.0), compare=False)
 
     def __repr__(self) -> str:
         return f"<Estimate, {self.kind}: {self.trajectory!r}>"
@@ -424,6 +429,37 @@ def residual_frame(measured: Iterable[tuple[str, Measurements, State, Array]] = 
     order = np.argsort(np.concatenate(parts["time"]), kind="stable")
     # column by column: of a long dive, sorting frames takes several times its memory
     return pd.DataFrame({name: np.concatenate(parts.pop(name))[order] for name in [*parts]})
+
+
+def current_frame(history: Mapping[str, History], layers: Measurements | None, knot_m: float) -> pd.DataFrame:
+    """The current at the knots that the cells of profiles are near, a profile each `CURRENT_S` or so.
+
+    Parameters
+    ----------
+    history : of the knots, over time
+    layers : measurements of the sensor "water_layer"; None = none
+    knot_m : depth from a knot to the next [m]
+    """
+    known = [name for name in LAYERS if name in history]
+    if layers is None or not isinstance(layers.model, WaterLayer) or len(known) < 2:
+        return pd.DataFrame(columns=pd.Index(CURRENT_COLUMNS))
+    informs = layers.W[:, 0, 0] > 2.0 / LARGEST_SD
+    context, measured = layers.model.context[informs], layers.time[informs]
+    of = np.column_stack([context[:, at.ABOVE_AT], context[:, at.BELOW_AT]]).astype(np.int64)
+    place = (of - LAYOUT[LAYERS[0]].start) // 2
+    first = context[:, at.FIRST_KNOT].astype(np.int64)[:, None]
+    knot = first + (place - first) % len(known)
+    profile = np.unique(measured)
+    profile = profile[np.diff(profile // CURRENT_S, prepend=-np.inf) > 0.0]
+    chosen = np.isin(measured, profile)
+    pairs = np.unique(np.column_stack([np.repeat(measured[chosen], 2), knot[chosen].ravel()]), axis=0)
+    time, knots = pairs[:, 0], pairs[:, 1].astype(np.int64)
+    values = np.full((len(pairs), 4), np.nan)
+    for k, name in enumerate(known):
+        here, walk = knots % len(known) == k, history[name]
+        keyframe = np.clip(np.searchsorted(walk.time, time[here] - 1e-6), 0, len(walk.time) - 1)
+        values[here] = np.column_stack([walk.value, walk.sd])[keyframe]
+    return pd.DataFrame(np.column_stack([time, knot_m * knots, values]), columns=pd.Index(CURRENT_COLUMNS))
 
 
 def reply_frame(measured: Iterable[tuple[str, Measurements]], config: Config | None = None) -> pd.DataFrame:

@@ -504,18 +504,13 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     if beams:
         assumptions.append(f"pings of the DVL by their {len(beams) - 1} beams, at {config.dvl.beams.angle_deg:g} deg")
     assumptions += [why_not] if why_not else []
-    layers, why_not = layer_sensors(config, log.streams)
-    if layers:
-        config = with_knots(config, log.streams)
-        knots, spacing = config.water.knots, config.water.knot_m
-        said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
-        assumptions.append(f"profiles of the water are used; the current: {said}")
-    assumptions += [why_not] if why_not else []
+    layers, config = _resolve_layers(log, config, expected, assumptions)
     config = _resolve_norths(log, config, assumptions)
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     config = _resolve_waves(log, config, assumptions)
     sources, present = heading_sources(config, log.sensors), log.sensors | {*expected, *beams, *layers}
+    present -= {"dvl_water"} if layers else set()
     compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
     config = _resolve_sound(log, config, assumptions)
     config = with_priors_stated(config, compass)
@@ -589,6 +584,22 @@ def _thrusters(log: Log, config: Config, expected: Collection[str]) -> list[str]
             "describe every thruster in the configuration"
         )
     return ["thruster"]
+
+
+def _resolve_layers(
+    log: Log, config: Config, expected: Collection[str], assumptions: list[str]
+) -> tuple[list[str], Config]:
+    """The sensors that profiles of the water become, and the configuration with the knots of the current."""
+    layers, why_not = layer_sensors(config, log.streams, expected)
+    if layers:
+        config = with_knots(config, log.streams, whole=not expected)
+        knots, spacing = config.water.knots, config.water.knot_m
+        said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        assumptions.append(f"profiles of the water are used; the current: {said}")
+        if "dvl_water" in log:
+            assumptions.append("dvl_water is left out: it is a mean of the cells of the profiles")
+    assumptions += [why_not] if why_not else []
+    return layers, config
 
 
 def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Config:

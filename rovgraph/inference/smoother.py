@@ -19,6 +19,7 @@ from rovgraph.inference.estimate import (
     body_trajectory,
     calibration_estimates,
     calibration_history,
+    current_frame,
     reply_frame,
     residual_frame,
 )
@@ -30,6 +31,7 @@ from rovgraph.inference.observability import shown, shown_below, without_what_no
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.inference.posterior import Posterior
 from rovgraph.log import Log
+from rovgraph.model.calibration import WATER_LAYER
 from rovgraph.model.state import BIAS, PLACE, POSE, VELOCITY, State
 from rovgraph.problem.admission import TimeOffsets
 from rovgraph.problem.assembly import assembly_of
@@ -254,6 +256,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         },
         Posterior.of(best, b) if isinstance(best, ChainOptimum) else None,
         reply_frame(best.blocks.items(), b.config),
+        current_frame(history, best.blocks.get(WATER_LAYER), b.config.water.knot_m),
     )
 
 

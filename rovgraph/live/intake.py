@@ -21,7 +21,7 @@ from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
-from rovgraph.model.calibration import ACOUSTICS
+from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -30,6 +30,7 @@ from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.pressure import DepthByPressure
+from rovgraph.sensors.water_layer import CELLS
 
 _STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship", "pressure": "depth"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
@@ -187,10 +188,10 @@ class Intake:
         return True
 
     def _names(self, sensor: str, values: Array) -> list[float]:
-        """Those of its values that stand for names."""
+        """Those of its values that tell measurements of one time apart."""
         if sensor not in self._name_columns:
             columns = SENSORS[sensor].columns if sensor in SENSORS else ()
-            self._name_columns[sensor] = [k for k, column in enumerate(columns) if column.label]
+            self._name_columns[sensor] = [k for k, c in enumerate(columns) if c.label or c.name == "adcp_range"]
         return [float(values[k]) for k in self._name_columns[sensor]]
 
     def _with_known_sd(self, sensor: str, values: Array) -> Array:
@@ -321,7 +322,8 @@ class Startup:
         self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]
-        sections = {name: getattr(self.config, name) for name in ACOUSTICS}
+        sections: dict[str, object] = {name: getattr(self.config, name) for name in ACOUSTICS}
+        sections[CELLS] = self.config.water
         unstated = {name for name, section in sections.items() if section == type(section)()}  # as a whole file has it
         later = [s for s in later if s.name not in unstated]
         expected = {s.name for s in later if s.heading_source is None or named}
@@ -347,7 +349,8 @@ ANYWHERE_M = 1e4  # sd of the start of a dive without a fix
 
 def is_late(m: Measurement, engine: FixedLag) -> bool:
     """Whether a measurement is of a sensor that the configuration has and the filter does not."""
-    if m.sensor not in LATE or m.sensor in engine.initial.instruments:
+    used = engine.initial.instruments
+    if m.sensor not in LATE or m.sensor in used or (m.sensor == "dvl_water" and WATER_LAYER in used):
         return False
     return m.sensor != "thruster" or engine.initial.config.graph.hydrodynamics
 

@@ -19,15 +19,16 @@ from rovgraph.inference.bottom import Bottom, bottom_under
 from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.trajectory import Trajectory
+from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
-from rovgraph.live.solution import BeaconPlace, Event, RangeCircle, SensorHealth, ShipPose, Solution
+from rovgraph.live.solution import BeaconPlace, CurrentAt, Event, RangeCircle, SensorHealth, ShipPose, Solution
 from rovgraph.log import Log, Measurement, Stream
-from rovgraph.model.calibration import BEAM_SENSORS, LAYOUT, MOUNT, TABLE, beacon_names
+from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
 from rovgraph.model.config import Config
 from rovgraph.model.origin import Origin, flat_error, outgrows_plane
 from rovgraph.problem.assembly import InsertResult
@@ -231,6 +232,7 @@ class Navigator:
             longitude=longitude,
             origin=self.origin,
             calibration=self._calibration(engine, known),
+            current=self._current(engine, known),
             sensors=self._sensors(),
             events=self._take_events(),
             verdict=self.alarms.verdict,
@@ -421,8 +423,24 @@ class Navigator:
         return {
             label: (value, value_sd)
             for name in engine.filter.unknowns.estimated
+            if name not in LAYERS
             for label, value, value_sd in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
         }
+
+    def _current(self, engine: FixedLag, known: Gaussian) -> tuple[CurrentAt, ...]:
+        """The current at its knots."""
+        knots = [name for name in LAYERS if name in engine.filter.unknowns.estimated]
+        first = float(engine.assembly.problem.keyframes[-1, FIRST_KNOT])
+        if not knots or not np.isfinite(first):
+            return ()
+        sd, columns = np.sqrt(known.covariance.diagonal()), engine.filter.layout.columns
+        depths = range(int(first), int(first) + len(knots))
+        spacing = engine.initial.config.water.knot_m
+        return tuple(
+            CurrentAt(spacing * j, *known.c[LAYOUT[name]].tolist(), *sd[columns[name]].tolist())
+            for j in depths
+            for name in [knots[j % len(knots)]]
+        )
 
     def _sound(self, m: Measurement) -> None:
         """Note which beams are valid, and ranges for the next solution: an altitude where beams have none."""

@@ -42,10 +42,12 @@ from rovgraph.live.solution import Event, SensorHealth
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.frozen import HOLDS, Company, Hold, Runs, companies, held, is_false_zero
 from rovgraph.log.streams import joined
+from rovgraph.model.calibration import WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.rules import RULES, SILENT_PERIODS, SILENT_S
 from rovgraph.sensors.dvl_beam import BEAMS
 from rovgraph.sensors.instruments import HEADING_STREAMS, heading_sources
+from rovgraph.sensors.water_layer import CELLS
 
 SILENT_AT_FIRST_S = 10.0  # after a first measurement, as long as the period is not known
 SELDOM_AT_FIRST_S = {"fix": 30.0}  # of sensors that measure less often
@@ -478,13 +480,14 @@ class Health:
         """All sensors at a time, but for single beams of a DVL."""
         return {
             sensor: SensorHealth(
-                "rejected" if sensor in self._out and watch.state == "ok" else watch.state,
+                "rejected" if counted in self._out and watch.state == "ok" else watch.state,
                 time - watch.time,
-                self.used[sensor],
-                self.rejected[sensor],
+                self.used[counted],
+                self.rejected[counted],
                 _failed(watch, time),
             )
             for sensor, watch in watches.items()
+            for counted in [WATER_LAYER if sensor == CELLS else sensor]
         }
 
     def of_beams(self, seen: Mapping[str, float], time: float) -> dict[str, SensorHealth]:

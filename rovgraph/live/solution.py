@@ -80,6 +80,16 @@ class RangeCircle(NamedTuple):
     radius: float
 
 
+class CurrentAt(NamedTuple):
+    """The current at a depth, by profiles of the water [m, m/s]."""
+
+    depth: float
+    north: float
+    east: float
+    north_sd: float
+    east_sd: float
+
+
 @dataclass(frozen=True)
 class Solution:
     """The navigation solution of one moment, of the body's origin.
@@ -103,6 +113,7 @@ class Solution:
     predicted_s : time since the newest keyframe, bridged by the IMU alone [s]
     latency_s : from the arrival of the newest measurement to this solution [s], None in a replay
     update_s : duration of the newest update [s]
+    current : by profiles of the water, at depths about the vehicle's, the shallowest first
     ship, beacons, ranges : of an acoustic system: the ship, beacons whose place is known, the newest ranges
     """
 
@@ -130,6 +141,7 @@ class Solution:
     predicted_s: float = 0.0
     latency_s: float | None = None
     update_s: float = 0.0
+    current: tuple[CurrentAt, ...] = ()
     ship: ShipPose | None = None
     beacons: tuple[BeaconPlace, ...] = ()
     ranges: tuple[RangeCircle, ...] = ()

@@ -17,10 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.errors import InputError, warn
+from rovgraph.geometry import Array
 from rovgraph.log.reading import delay_of, read_streams
 from rovgraph.log.streams import Stream
 from rovgraph.log.tables import Table, read_table, table_beside, table_of_arrays
@@ -100,10 +100,11 @@ def _streams(table: Table, columns: dict[str, str], config: Config, sensor: str)
     return read_streams([table], own, table.source)[0]
 
 
-def beams_frame(beams: Stream) -> pd.DataFrame:
-    """The stream as the table is written, without the columns that are empty."""
-    filled = {name: beams[name] for name in beams.columns if np.isfinite(beams[name]).any()}
-    return pd.DataFrame({"time": beams.time, **{name.removeprefix(PREFIX): v for name, v in filled.items()}})
+def columns_beside(stream: Stream) -> dict[str, Array]:
+    """A stream of beams or cells as the columns of its table, without those that are empty."""
+    prefix = PREFIX if stream.sensor == BEAMS else CELL_PREFIX
+    filled = {name.removeprefix(prefix): stream[name] for name in stream.columns if np.isfinite(stream[name]).any()}
+    return {"time": stream.time, **filled}
 
 
 def usable_beams(table: Path | Arrays, config: Config, source: str = "") -> Stream | None:

@@ -17,7 +17,6 @@ from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_prec
 from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
 from rovgraph.model.config import Config, config_or_defaults
 from rovgraph.model.origin import Origin
-from rovgraph.sensors.dvl_beam import BEAMS
 
 
 @dataclass(frozen=True, repr=False)
@@ -175,13 +174,7 @@ class Log:
         -----
         DataWarning : beams of another time than the log's; they are left out
         """
-        if beams is None:
-            return self
-        joined = self._with(beams, "the DVL's beams")
-        if BEAMS not in joined:
-            return joined
-        found, config = {BEAMS: beams}, config_or_defaults(self.config)
-        return replace(joined, streams={**joined.streams, **with_sound_speed(found, self.streams, config)})
+        return self if beams is None else self._with(beams, "the DVL's beams")
 
     def with_profiles(self, cells: Stream | None) -> "Log":
         """The log with profiles of the water beside its other streams.
@@ -200,7 +193,9 @@ class Log:
         """The log with a stream of a table beside it."""
         first, last = float(stream.time[0]), float(stream.time[-1])
         if first <= self.end and last >= self.start:
-            return replace(self, streams={**self.streams, stream.sensor: stream})
+            as_measured = {stream.sensor: stream}
+            corrected = with_sound_speed(as_measured, self.streams, config_or_defaults(self.config))
+            return replace(self, streams={**self.streams, **as_measured, **corrected})
         with collected_warnings() as texts:
             warn(
                 f"{self.source}: {what} have times from {first:.1f} to {last:.1f} s, the log from {self.start:.1f} to "

@@ -333,9 +333,12 @@ class Water(ConfigSection):
     knot_m: Positive = Field(10.0, description="depth from one knot to the next, at least")
     current_sd_mps: Positive = Field(0.3, description="sd of the current at any depth, north and east")
     correlation_m: Positive = Field(60.0, description="depth over which the correlation of the current falls to 1/e")
-    walk_mps: Positive = Field(5e-4, description="random walk of the current at a knot [m/s/rts]")
+    walk_mps: Positive = Field(6e-3, description="random walk of the current at a knot [m/s/rts]")
     cell_sd_mps: PositiveTriple = Field(
         (0.05, 0.05, 0.02), description="noise of a cell's velocity, DVL axes; sd of the table takes precedence"
+    )
+    vertical_sd_mps: NotNegative = Field(
+        0.05, description="motion of the water up and down, which is not estimated; to the noise of the DVL's z axis"
     )
     cell_correlation: Annotated[float, Field(ge=0, lt=0.5)] = Field(
         0.15, description="correlation of neighbouring cells, by which their noise is widened"

@@ -213,9 +213,11 @@ class Assembly:
             cells, layers.waiting = layers.waiting, []
             time, data, row = (np.array([c[k] for c in cells]) for k in (0, 2, 3))
             events = self._events
-            before = np.flatnonzero(
-                (events[:, at.SENSOR] == self._which[WATER_LAYER]) & (events[:, at.STAMP] <= time[0])
-            )
+            upto = int(events[:, at.STAMP].searchsorted(time[0], side="right"))
+            back = max(upto - BUFFER, 0)
+            while back and not (events[back:upto, at.SENSOR] == self._which[WATER_LAYER]).any():
+                back = max(back - (upto - back), 0)
+            before = back + np.flatnonzero(events[back:upto, at.SENSOR] == self._which[WATER_LAYER])
             first = int(events[before[-1], -self._context + FIRST_KNOT]) if len(before) else None
             imu = self._table[:0] if self._no_imu else self._table
             made = layers.of(Stream(CELLS, (), time, data, row), imu, first, self._left_out)

@@ -17,7 +17,7 @@ velocity relative to a layer between two knots; they hold all that the cells say
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import copy
 from typing import NamedTuple
 
@@ -45,15 +45,19 @@ TOGETHER_S = 1e-4  # stamps of the cells of one profile
 SAME_M = 1e-6  # depths that differ by rounding
 FILLED = 1e-9  # part of a knot's weight below which no cell is near it
 OUT_OF_SIGHT = 1e3  # sd by which what stood in a knot's place before is forgotten [m/s]
+BESIDE, UNLIKE_SD = 2, 6.0  # cells on each side that a cell is compared with, and how far it may be off
+UNLIKE = "rising or sinking unlike the cells beside them"
 SIDE_LOBES = "at the bottom or the surface (side lobes)"
 _COLUMN = {name: k for k, name in enumerate(ADCP.column_names)}
 Left = Counter[tuple[str, str]]
 
 
-def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[str], str]:
-    """The sensor that a log's profiles become; and why not, if not so."""
+def layer_sensors(
+    config: Config, streams: Mapping[str, Stream], expected: Collection[str] = ()
+) -> tuple[list[str], str]:
+    """The sensor that a log's profiles become, or those that are expected; and why not, if not so."""
     if CELLS not in streams or not config.water.use:
-        return [], ""
+        return [WATER_LAYER] if CELLS in expected and config.water.use else [], ""
     left = "profiles of the water are left out: "
     cells, columns = streams[CELLS].data, _COLUMN
     measured = np.isfinite(cells[:, [columns[name] for name in (*VELOCITIES, *ALONG, *EARTH)]])
@@ -61,7 +65,7 @@ def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[s
         return [], left + "no velocities, expected adcp_vx, adcp_beam_1 or adcp_north"
     if not np.isfinite(cells[:, columns["adcp_range"]]).any():
         return [], left + "cells without ranges; give column range, from the head to the middle of each cell"
-    if "depth" not in streams:
+    if "depth" not in {*streams, *expected}:
         return [], left + "the log has no depth"
     earth = measured[:, len(VELOCITIES) + len(ALONG) :].any()
     if earth and not np.isfinite(cells[:, [columns[name] for name in ATTITUDE]]).all(axis=1).any():
@@ -74,14 +78,17 @@ def layer_sensors(config: Config, streams: Mapping[str, Stream]) -> tuple[list[s
     return [WATER_LAYER], ""
 
 
-def with_knots(config: Config, streams: Mapping[str, Stream]) -> Config:
-    """The configuration with as many knots as the cells of a log reach over, farther apart where these are too few."""
+def with_knots(config: Config, streams: Mapping[str, Stream], whole: bool = True) -> Config:
+    """The configuration with as many knots as the cells of a log reach over, farther apart where these are too few.
+
+    Where it is not the ``whole`` log, cells that reach further may come: then all knots there can be.
+    """
     if config.water.knots is not None:
         return config
-    far = streams[CELLS].data[:, _COLUMN["adcp_range"]]
+    far = streams[CELLS].data[:, _COLUMN["adcp_range"]] if CELLS in streams else np.zeros(0)
     reach = float(np.nanmax(far, initial=0.0))
     spacing = max(config.water.knot_m, reach / (len(LAYERS) - 2))
-    knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS))
+    knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS)) if whole else len(LAYERS)
     water = config.water.model_copy(update={"knots": max(knots, 2), "knot_m": spacing})
     return config.model_copy(update={"water": water})
 
@@ -207,11 +214,14 @@ class WaterLayers:
         if math.isnan(depth):
             left_out[CELLS, f"without a depth within {FRESH_S:g} s"] += len(data)
             return empty, first
-        down_b = _level(imu, time)
+        down_b = self._down(data, imu, time)
         bottom = np.nanmin(data[:, _COLUMN["adcp_bottom"]], initial=self._altitude(time))
         limit = depth if self.config.water.looks == "up" else bottom
         data = self._admitted(data, limit * self._cosine, left_out)
         cells = self._cells(data, down_b)
+        alike = self._alike(cells, self._R_bs.T @ down_b)
+        left_out[CELLS, UNLIKE] += int((~alike).sum())
+        cells = Cells(*(a[alike] for a in cells))
         if not len(cells.down):
             return empty, first
         head, spacing, K = depth + float(self._below_sensor @ down_b), self.config.water.knot_m, len(self._places)
@@ -223,6 +233,11 @@ class WaterLayers:
         within = place < first + K - 1
         left_out[CELLS, "beyond the knots of the current"] += int((~within).sum())
         return self._rows(place[within], Cells(*(a[within] for a in cells)), first), first
+
+    def _down(self, data: Array, imu: Array, time: float) -> Array:
+        """Direction down in b, shape (3,), by the instrument's own tilt where the table has it, else by the IMU."""
+        tilt = data[0, [_COLUMN["adcp_roll"], _COLUMN["adcp_pitch"]]]
+        return self._R_bs @ matrix_from_rpy([*tilt, 0.0])[2] if np.isfinite(tilt).all() else _level(imu, time)
 
     def _admitted(self, data: Array, far: float, left_out: Left) -> Array:
         """Cells that may be used; their far end is nearer than ``far`` [m]."""
@@ -257,10 +272,28 @@ class WaterLayers:
         good = np.isfinite(v).all(axis=1)
         return Cells(down[good], v[good], data[good, _COLUMN["adcp_sd"]])
 
+    def _relative(self, sd: Array) -> Array:
+        """Noise of cells over the one that is believed, shape (n,)."""
+        believed = self.config.water.cell_sd_mps[0]
+        return np.where(np.isfinite(sd), np.minimum(sd, LARGEST_SD), believed) / believed
+
+    def _alike(self, cells: Cells, down_s: Array) -> NDArray[np.bool_]:
+        """Cells of whose vertical velocity two on each side do not show that it is far off."""
+        n = len(cells.down)
+        alike = np.ones(n, bool)
+        if n > BESIDE:
+            order = np.argsort(cells.down)
+            vertical = cells.velocity[order] @ down_s
+            padded = np.pad(vertical, BESIDE, constant_values=np.nan)
+            median = np.nanmedian([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            sd = self._relative(cells.sd[order]) * self.config.water.cell_sd_mps[2]
+            alike[order] = np.abs(vertical - median) <= UNLIKE_SD * sd
+        return alike
+
     def _rows(self, place: Array, cells: Cells, first: int) -> Array:
         """At most one measurement between two knots; ``place`` is the depth of each cell in knots."""
         believed, rho = np.array(self.config.water.cell_sd_mps), self.config.water.cell_correlation
-        relative = np.where(np.isfinite(cells.sd), np.minimum(cells.sd, LARGEST_SD), believed[0]) / believed[0]
+        relative = self._relative(cells.sd)
         K = len(self._places)
         above = np.floor(place).astype(np.int64) - first if K > 1 else np.zeros(len(place), np.int64)
         share, weight = place - np.floor(place), 1.0 / np.square(relative)
@@ -286,7 +319,8 @@ class WaterLayers:
             context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
             context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
             context[[at.SHARE, at.FIRST_KNOT]] = before / total, first
-            out.append(np.concatenate([q / total, widened / total, context, [float(k)]]))
+            sd = np.hypot(widened / total, [0.0, 0.0, self.config.water.vertical_sd_mps])
+            out.append(np.concatenate([q / total, sd, context, [float(k)]]))
         return np.array(out).reshape(-1, 7 + at.LAYER_WIDTH)
 
 

@@ -1,4 +1,8 @@
-"""Nortek AD2CP files: bottom tracks of Signature instruments (record 0x17), tracks of DVLs (0x1B, 0x1D)."""
+"""Nortek AD2CP files: bottom tracks of Signature instruments (record 0x17), tracks of DVLs (0x1B, 0x1D), profiles.
+
+Velocities of a profile (records 0x15, 0x16) are those of the water away from the instrument; cell n, from 1, is at the
+blanking distance and n cells along its axis.
+"""
 
 import mmap
 from collections.abc import Iterator
@@ -26,7 +30,9 @@ from rovgraph.readers.recording import Channel, Clock, Left, Recording, sound_of
 from rovgraph.readers.records import gathered, layout
 from rovgraph.readers.stamps import unix_of_calendar
 from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.water_layer import CELLS
 
+BURST, AVERAGE = 0x15, 0x16
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
 ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
@@ -34,10 +40,13 @@ ENU, XYZ, BEAM = range(3)  # coordinates of a Signature's velocities
 BEAM_ANGLE_DEG = 25.0  # of a Signature, as its own transformation matrix has it
 AZIMUTHS_DEG = [0.0, 270.0, 180.0, 90.0]  # of its beams
 BEAM_ANGLE = np.deg2rad(BEAM_ANGLE_DEG)
+BAD = -32768
 NO_MERIT = 65535  # figure of merit of a beam that heard nothing
+PROFILE_VERSION = 3
+BLANKING_IN_CM = 1 << 1  # of the status, else mm
 HAS_VELOCITY, HAS_DISTANCE, HAS_MERIT = 1 << 5, 1 << 8, 1 << 9
 OTHERS = {
-    0x15: "burst of a profile", 0x16: "average of a profile", 0x18: "burst of the fifth beam",
+    BURST: "burst of a profile", AVERAGE: "average of a profile", 0x18: "burst of the fifth beam",
     0x1A: "raw altimeter", 0x1C: "echo sounder", 0x1E: "altimeter", 0x1F: "average altimeter", 0xA0: "text",
 }  # fmt: skip
 _HEAD = [("version", "u1", 0), ("offset", "u1", 1)]
@@ -46,6 +55,11 @@ SIGNATURE_FIELDS = layout(
     *_HEAD, ("config", "<u2", 2), ("date", _DATE, 8), ("fraction", "<u2", 14), ("sound", "<u2", 16),
     ("temperature", "<i2", 18), ("pressure", "<u4", 20),
     ("heading", "<u2", 24), ("pitch", "<i2", 26), ("roll", "<i2", 28), ("beams", "<u2", 30), ("scale", "i1", 60),
+)  # fmt: skip
+PROFILE_FIELDS = layout(
+    *_HEAD, ("config", "<u2", 2), ("date", _DATE, 8), ("fraction", "<u2", 14),
+    ("heading", "<u2", 24), ("pitch", "<i2", 26), ("roll", "<i2", 28), ("beams", "<u2", 30),
+    ("cell", "<u2", 32), ("blank", "<u2", 34), ("scale", "i1", 58), ("status", "<u4", 68),
 )  # fmt: skip
 DVL_FIELDS = layout(
     *_HEAD, ("date", _DATE, 6), ("fraction", "<u2", 12), ("status", "<u4", 20), ("sound", "<f4", 24),
@@ -83,11 +97,16 @@ class AD2CP:
                 channels += bottom_channels(track, f"bottom track {kind:#x}", CLOCK)
                 if table := beam_table(track):
                     tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = table
-        channels += _attitude(content, found)
-        channels += _pressure(content, found)
-        water, of_dvl = _sound(content, found)
+        profile = AVERAGE if found.at.get(AVERAGE) else BURST
+        cells, apart = profiles(content, found, profile)
+        if cells:
+            tables[CELLS] = cells
+        header = SIGNATURE if found.at.keys() & {SIGNATURE, DVL_BOTTOM} else profile  # whose head is the same
+        channels += _attitude(content, found, header)
+        channels += _pressure(content, found, header)
+        water, of_dvl = _sound(content, found, header)
         channels += water
-        if np.isfinite(signature.beams).any():
+        if np.isfinite(signature.beams).any() or "beam_1" in cells:
             of_dvl["beams"] = {"angle_deg": BEAM_ANGLE_DEG, "azimuth_deg": AZIMUTHS_DEG}
         elif any("velocity_1" in table for table in tables.values()):
             notes.append("where the beams of a Nortek DVL point is not stated: rovgraph calibrate dvl-beams fits it")
@@ -99,7 +118,7 @@ class AD2CP:
             notes.append("pressure is above the offset that the instrument has, the air's as it was set")
         return Recording(
             str(path), self.name, tuple(channels), {CLOCK: Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")},
-            tuple(_left(found, refused)), settings, tuple(notes),
+            tuple(_left(found, refused, profile, apart)), settings, tuple(notes),
             tuple(_warnings(found, refused, channels)),
             tables=tables,
         )  # fmt: skip
@@ -148,6 +167,46 @@ def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[Norte
     distance = np.where(heard, 1e-3 * parts["distance"], np.nan)
     track = NortekTrack(time, np.zeros(count), -velocity, empty[:, :3], distance, beams, merit)
     return track, int(np.count_nonzero(~known))
+
+
+def profiles(content: bytes | mmap.mmap, found: Records, kind: int) -> tuple[dict[str, Array], int]:
+    """The cells of a kind of profile: column -> ndarray, shape (n,), as `rovgraph.log.companions` has them; {} = none.
+
+    With them, how many profiles are left out: of another version of the record, or not of four beams.
+    """
+    at, size = np.array(found.at.get(kind, []), np.int64), np.array(found.size.get(kind, []), np.int64)
+    records, there = gathered(content, PROFILE_FIELDS, at.tolist(), size.tolist(), PROFILE_FIELDS.itemsize)
+    count, system = (records["beams"] & 0x3FF).astype(np.int64), (records["beams"] >> 10) & 3
+    good = there & (records["version"] == PROFILE_VERSION) & (records["beams"] >> 12 == 4) & (system <= BEAM)
+    good &= (records["config"] & HAS_VELOCITY != 0) & (size >= records["offset"] + 8 * count)
+    raw = np.full((len(records), int(count[good].max(initial=0)), 4), np.nan)
+    for n in np.unique(count[good]).tolist():
+        of = np.flatnonzero(good & (count == n))
+        fields, first = layout(("value", f"(4,{n})<i2", 0)), at[of] + records["offset"][of]
+        values, _ = gathered(content, fields, first.tolist(), [fields.itemsize] * len(of), fields.itemsize)
+        raw[of, :n] = values["value"].swapaxes(1, 2)
+    raw[raw == BAD] = np.nan
+    raw *= 10.0 ** records["scale"][:, None, None].astype(float)
+    time = _time(records["date"], records["fraction"])
+    of, cell = np.nonzero(np.isfinite(raw).any(axis=2) & np.isfinite(time)[:, None])
+    if not len(of):
+        return {}, int(np.count_nonzero(~good))
+    away, by_beams = raw[of, cell], system[of] == BEAM
+    rpy = np.deg2rad(0.01 * np.column_stack([records[name].astype(float) for name in ("roll", "pitch", "heading")]))
+    velocity = np.column_stack([away[:, :2], _either(away[:, 2:])])
+    turned = system[of] == ENU
+    velocity[turned] = _of_enu(velocity[turned], rpy[of][turned])
+    velocity[by_beams] = np.nan
+    away[~by_beams] = np.nan
+    blank = np.where(records["status"] & BLANKING_IN_CM, 0.01, 0.001) * records["blank"]
+    table = {
+        "time": time[of],
+        "range": blank[of] + 1e-3 * records["cell"][of] * (cell + 1.0),
+        "cell": 1e-3 * records["cell"][of],
+        **dict(zip(("vx", "vy", "vz"), -velocity.T, strict=True)),
+        **{f"beam_{k + 1}": -away[:, k] for k in range(4)},
+    }
+    return {n: v for n, v in table.items() if np.isfinite(v).any()}, int(np.count_nonzero(~good))
 
 
 def _of_enu(velocity: Array, rpy: Array) -> Array:
@@ -201,45 +260,47 @@ def _time(date: NDArray[np.uint8], fraction: NDArray[np.uint16]) -> Array:
     return unix_of_calendar(year + 1900, month + 1, day, hour, minute, second) + 1e-4 * fraction
 
 
-def _attitude(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
-    at, size = found.at.get(SIGNATURE, []), found.size.get(SIGNATURE, [])
+def _attitude(content: bytes | mmap.mmap, found: Records, header: int) -> Iterator[Channel]:
+    at, size = found.at.get(header, []), found.size.get(header, [])
     records, there = gathered(content, SIGNATURE_FIELDS, at, size, SIGNATURE_FIELDS.itemsize)
     if not there.any():
         return
     time = _time(records["date"], records["fraction"])
     heading, pitch, roll = (np.deg2rad(0.01 * records[name].astype(float)) for name in ("heading", "pitch", "roll"))
-    source = "bottom track 0x17"
+    source = f"record {header:#x}"
     yield Channel("dvl_heading", {"time": time, "dvl_heading": wrap_angle(heading)}, f"{source}: heading", "", CLOCK)
     yield Channel("vehicle_tilt", {"time": time, "roll": roll, "pitch": pitch}, f"{source}: roll, pitch", "", CLOCK)
 
 
-def _pressure(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:
+def _pressure(content: bytes | mmap.mmap, found: Records, header: int) -> Iterator[Channel]:
     for kind, fields, to_pascal in (
         (DVL_BOTTOM, DVL_FIELDS, BAR),
-        (SIGNATURE, SIGNATURE_FIELDS, 1e-3 * 0.1 * BAR),
+        (header, SIGNATURE_FIELDS, 1e-3 * 0.1 * BAR),
     ):
         records, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
         if there.any():
             pascal = to_pascal * records["pressure"].astype(float)
             time = _time(records["date"], records["fraction"])
-            yield Channel("depth", {"time": time, "pressure": pascal}, f"bottom track {kind:#x}: pressure", "", CLOCK)
+            yield Channel("depth", {"time": time, "pressure": pascal}, f"record {kind:#x}: pressure", "", CLOCK)
 
 
-def _sound(content: bytes | mmap.mmap, found: Records) -> tuple[list[Channel], dict[str, Any]]:
+def _sound(content: bytes | mmap.mmap, found: Records, header: int) -> tuple[list[Channel], dict[str, Any]]:
     """Speed of sound and temperature, as `sound_of_dvl` has them."""
-    for kind, fields, speed, degree in ((DVL_BOTTOM, DVL_FIELDS, 1.0, 1.0), (SIGNATURE, SIGNATURE_FIELDS, 0.1, 0.01)):
+    for kind, fields, speed, degree in ((DVL_BOTTOM, DVL_FIELDS, 1.0, 1.0), (header, SIGNATURE_FIELDS, 0.1, 0.01)):
         records, there = gathered(content, fields, found.at.get(kind, []), found.size.get(kind, []), fields.itemsize)
         if (records := records[there]).size:
             sound, temperature = speed * records["sound"].astype(float), degree * records["temperature"].astype(float)
             time = _time(records["date"], records["fraction"])
-            return sound_of_dvl(time, sound, temperature, f"bottom track {kind:#x}", CLOCK)
+            return sound_of_dvl(time, sound, temperature, f"record {kind:#x}", CLOCK)
     return [], {}
 
 
-def _left(found: Records, refused: int) -> Iterator[Left]:
+def _left(found: Records, refused: int, profile: int, apart: int) -> Iterator[Left]:
     for kind, at in sorted(found.at.items()):
-        if kind not in (SIGNATURE, DVL_BOTTOM, DVL_WATER):
+        if kind not in (SIGNATURE, DVL_BOTTOM, DVL_WATER, profile):
             yield Left(OTHERS.get(kind, f"record {kind:#04x}"), len(at), "no measurement of a sensor")
+    if apart:
+        yield Left(OTHERS[profile], apart, "not of four beams, or of another version than 3")
     if found.failed:
         yield Left("record", found.failed, "a wrong checksum, or cut off")
     if refused:

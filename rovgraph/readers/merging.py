@@ -56,7 +56,7 @@ class Merged:
     settings : from the files, dotted key -> (value, file)
     warnings : what looks wrong, a sentence each
     tables : other tables of the files (name -> column -> ndarray, shape (n,)), their ``time`` by the log's clock [s].
-        Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL
+        Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL, or else the first
     """
 
     parts: Sequence[Part]
@@ -170,7 +170,8 @@ def _tables(
     clocks : file and clock -> JoinedClock
     shift : that is stated of the DVL alone [s]
     """
-    feeds = next((each.file for each in selected if each.channel.sensor == "dvl"), None)
+    of_dvl = (each.file for each in selected if each.channel.sensor == "dvl")
+    feeds = next(of_dvl, next((k for k, recording in enumerate(recordings) if recording.tables), None))
     out: dict[str, dict[str, Array]] = {}
     for k, recording in enumerate(recordings):
         stamping = sorted(recording.channels, key=lambda channel: not channel.sensor.startswith("dvl"))

@@ -12,7 +12,7 @@ import numpy as np
 
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
-from rovgraph.log.companions import beams_beside, beams_frame
+from rovgraph.log.companions import beams_beside, cells_beside, columns_beside
 from rovgraph.log.reading import in_order, numbers, read_columns
 from rovgraph.log.stamps import UNIX_S
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, VERSION_COLUMN, is_column
@@ -21,7 +21,6 @@ from rovgraph.log.units import name_and_bracket
 from rovgraph.model.config import Config, config_or_defaults
 from rovgraph.readers.formats import ReadingOptions, formats, head_of, is_text, purpose, recognise, refusal
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
-from rovgraph.sensors.dvl_beam import BEAMS
 
 Paths = Path | str | Sequence[Path | str]  # of the files of one dive
 NOTHING: Mapping[str, Any] = {}
@@ -46,7 +45,7 @@ class OwnLog:
             python_warnings.simplefilter("ignore")  # the join repeats them with the name of the file
             table = read_table(path)
             cells, names = read_columns(table, options.table)
-            beams = beams_beside(path, config_or_defaults(None))
+            beside = beams_beside(path, config_or_defaults(None)), cells_beside(path, config_or_defaults(None))
             if RECEIVED in table.names:
                 cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
             try:
@@ -63,7 +62,7 @@ class OwnLog:
             clocks[IN_RECEIVED] = Clock(IN_RECEIVED, 0.0, 0.0, "Unix time of arrival")
         ignored = [name for name in table.names if name not in (*names.values(), RECEIVED, VERSION_COLUMN)]
         left = tuple(Left(name, int(table.frame[name].notna().sum()), "no column of a log") for name in ignored)
-        tables = {} if beams is None else {BEAMS: {str(n): c.to_numpy(float) for n, c in beams_frame(beams).items()}}
+        tables = {stream.sensor: columns_beside(stream) for stream in beside if stream is not None}
         return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts), tables=tables)
 
 

@@ -1,7 +1,8 @@
-"""Teledyne PD0 files (.pd0, .000, .ENR, .adc): bottom track, water track, attitude and depth of each ensemble.
+"""Teledyne PD0 files (.pd0, .000, .ENR, .adc): bottom and water track, profiles, attitude, depth of each ensemble.
 
-Bottom track is the velocity of the bottom against the instrument; a log has the instrument's over the bottom. Axes are
-forward (beam 3, or the ship's bow), starboard, down, whatever the file's are (`rovgraph.readers.trdi`).
+Bottom track is the velocity of the bottom against the instrument; a log has the instrument's over the bottom, and
+relative to the water in the cells of a profile. Axes are forward (beam 3, or the ship's bow), starboard, down, whatever
+the file's are (`rovgraph.readers.trdi`).
 
 WinRiver and VmDas write a receiver's fixes beside the pings, with their time of day (UTC) and how long before the ping
 they came, which gives the error of the instrument's clock. Sources: Teledyne RD Instruments, WinRiver II User's
@@ -31,20 +32,35 @@ from rovgraph.readers.nmea_sentences import RANGE_SD_M, day_time, number
 from rovgraph.readers.recording import Channel, Clock, Left, Recording
 from rovgraph.readers.records import gathered, layout
 from rovgraph.readers.stamps import unix_of_calendar
-from rovgraph.readers.trdi import BEAM, CLOCK, EARTH, Attitude, BeamHead, Pings, forward_starboard_down, recording
+from rovgraph.readers.trdi import (
+    BEAM,
+    CLOCK,
+    EARTH,
+    SHIP,
+    Attitude,
+    BeamHead,
+    Pings,
+    beams_setting,
+    forward_starboard_down,
+    recording,
+)
+from rovgraph.sensors.water_layer import CELLS
 
 SYNC = b"\x7f\x7f"
-FIXED, VARIABLE, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0600, 0x2000
+FIXED, VARIABLE, PROFILE, CORRELATION, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0100, 0x0200, 0x0600, 0x2000
 SENTENCES, GGA, HEADING = 0x2022, 0x2101, 0x2104  # of receivers: decoded by WinRiver, and as text
-SEVERAL = (SENTENCES, GGA, HEADING)
+SEVERAL = (PROFILE, CORRELATION, SENTENCES, GGA, HEADING)
 
 LAYOUTS = {
     FIXED: layout(
         ("system", "<u2", 4),
+        ("cells", "u1", 9),  # of a profile
+        ("length", "<u2", 12),  # of one [cm]
         ("coordinates", "u1", 25),
         ("alignment", "<i2", 26),  # of beam 3 against the bow [0.01 deg]
         ("bias", "<i2", 28),  # added to the heading [0.01 deg]
         ("source", "u1", 30),  # which values come from its own sensors
+        ("first", "<u2", 32),  # distance to the middle of the first cell, along the vertical [cm]
         ("beam_angle", "u1", 58),  # [deg]
     ),
     VARIABLE: layout(
@@ -72,8 +88,6 @@ LAYOUTS = {
 LEAST = {FIXED: 42, VARIABLE: 40, BOTTOM: 48, NAVIGATION: 24}  # bytes, as older firmware writes them
 OTHERS = {
     0x0001: "fixed leader of another kind",
-    0x0100: "velocity profile",
-    0x0200: "correlation profile",
     0x0300: "echo intensity profile",
     0x0400: "percent-good profile",
     0x0500: "status profile",
@@ -184,6 +198,9 @@ def _keep(found: Ensembles, table: list[tuple[int, int]], end: int) -> None:
 
 ZONE_SD_S = 6 * 3600.0  # of a clock without a stated time zone
 BAD = -32768
+MAPPED = 0b1  # cells by their depths
+FAINT = 64  # correlation that Teledyne's instruments want at least, of 128 [counts]
+FEWEST, MOST_GROUPS = 30, 10  # error velocities that show the noise of cells, and groups of them
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
 THERMOMETER, COMPUTED_SOUND = 0b1, 0b100_0000  # the temperature does; the speed of sound follows from what is measured
@@ -253,6 +270,7 @@ class PD0:
         if receiver is not None:
             clock = Clock(CLOCK, receiver.offset, receiver.offset_sd, f"{receiver.source}, written with the pings")
         made = recording(path, self.name, pings, clock, tuple(_left(found)), tuple(warnings))
+        made = _with_profiles(made, content, found, pings)
         return made if receiver is None else _with(made, receiver)
 
 
@@ -472,6 +490,74 @@ def decoded(content: bytes | mmap.mmap, found: Ensembles) -> Pings:
         position=position,
         tracked=tracked,
     )
+
+
+def _with_profiles(made: Recording, content: bytes | mmap.mmap, found: Ensembles, pings: Pings) -> Recording:
+    """A recording with the cells of the profiles that look down, or up where none does, as a table."""
+    fixed, _ = found.records(content, FIXED)
+    most = int(fixed["cells"].max(initial=0))
+    rows, ensemble = found.records_of(content, PROFILE, layout(("velocity", f"({most},4)<i2", 2)))
+    size = np.array(found.several[PROFILE], np.int64).reshape(-1, 3)[:, 2]
+    attitude, raw = _attitude(fixed, pings.system, pings.rpy), rows["velocity"]
+    heard = np.arange(most) < np.minimum(fixed["cells"][ensemble], (size - 2) // 8)[:, None]
+    heard = heard[:, :, None] & (raw != BAD) & raw.any(axis=2, keepdims=True)  # zeros throughout: not measured
+    heard &= (np.isfinite(pings.time) & (fixed["first"] > 0))[ensemble, None, None]
+    up = attitude.upward[ensemble] & heard.any(axis=(1, 2))
+    away = up & bool((heard.any(axis=(1, 2)) & ~up).any())
+    row, cell = np.nonzero(heard.any(axis=2) & ~away[:, None])
+    if not len(row):
+        return made
+    of = ensemble[row]
+    system, rpy = pings.system[of], attitude.rpy[of]
+    values = np.where(heard[row, cell], 0.001 * raw[row, cell], np.nan)
+    by_cell = Attitude(rpy, attitude.tilted[of], attitude.upward[of], attitude.beam_angle[of], attitude.convex[of])
+    velocity, error = forward_starboard_down(values, system, by_cell)
+    along = (system == BEAM) & (pings.head is not None)
+    alike, number = found.records_of(content, CORRELATION, layout(("value", f"({most},4)u1", 2)))
+    third = np.zeros((len(found), most))
+    third[number] = np.sort(alike["value"], axis=2)[:, :, 1]
+    sd = _noise(error, third[of, cell], cell)
+    of_three = np.isnan(error) & ~along & (np.isfinite(error).sum() > 0.5 * len(of))
+    faint = ~of_three & (third[of, cell] < FAINT) & third.any()
+    mapped = (system >= SHIP) & by_cell.tilted & (fixed["coordinates"][of] & MAPPED != 0)
+    level = np.where(mapped, np.cos(rpy[:, 0]) * np.cos(rpy[:, 1]), 1.0)  # by it, ranges of these are depths
+    tilted = bool(np.ptp(pings.rpy[:, :2], axis=0).any())
+    cells = {
+        "time": pings.time[of],
+        "range": 0.01 * (fixed["first"][of] + cell * fixed["length"][of].astype(float)) / level,
+        "cell": 0.01 * fixed["length"][of] / level,
+        **dict(zip(("vx", "vy", "vz"), np.where(along, np.nan, -velocity.T), strict=True)),
+        **{f"beam_{k + 1}": np.where(along, values[:, k], np.nan) for k in range(4)},
+        "sd": sd,
+        "bottom": np.fmin.reduce(pings.range, axis=1)[of],
+        **({"roll": rpy[:, 0], "pitch": rpy[:, 1]} if tilted else {}),
+    }
+    unused = [("cell", of_three, "of three beams"), ("cell", faint, "low correlation")]
+    unused.append(("profile", away, "looks the other way"))
+    settings = {**made.settings, "water": {"beam_angle_deg": round(float(np.rad2deg(by_cell.beam_angle.max())), 3)}}
+    if up.any() and not away.any():
+        settings["water"]["looks"] = "up"
+    if along.any() and pings.head is not None:
+        settings["dvl"] = {"beams": beams_setting(pings.head)} | settings.get("dvl", {})
+    return replace(
+        made,
+        left=(*made.left, *(Left(what, int(bad.sum()), why) for what, bad, why in unused if bad.any())),
+        settings=settings,
+        tables={**made.tables, CELLS: {n: v[~(of_three | faint)] for n, v in cells.items() if np.isfinite(v).any()}},
+    )
+
+
+def _noise(error: Array, correlation: Array, cell: NDArray[np.int64]) -> Array:
+    """Noise of a horizontal axis, by the error velocities of cells of like correlation, shape (n,); NaN = not known.
+
+    The error velocity has the variance of X and of Y. Without correlations, cells of like number stand together.
+    """
+    out, known = np.full(len(error), np.nan), np.flatnonzero(np.isfinite(error))
+    order = known[np.lexsort((cell[known], correlation[known]))]
+    if len(order) >= FEWEST:
+        for group in np.array_split(order, min(MOST_GROUPS, len(order) // FEWEST)):
+            out[group] = 1.4826 * np.median(np.abs(error[group]))
+    return np.where(out > 0.0, out, np.nan)
 
 
 def _attitude(fixed: NDArray[np.void], system: NDArray[np.integer], rpy: Array) -> Attitude:

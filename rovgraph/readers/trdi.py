@@ -237,8 +237,7 @@ def _settings(pings: Pings, sound: dict[str, Any], measured: bool) -> dict[str, 
     if sound:
         out["dvl"] = sound
     if pings.head is not None and np.isfinite(pings.beams).any():
-        stated = {"angle_deg": pings.head.angle_deg, "azimuth_deg": AZIMUTHS_DEG}
-        out["dvl"] = out.get("dvl", {}) | {"beams": stated | ({} if pings.head.convex else {"convex": False})}
+        out["dvl"] = out.get("dvl", {}) | {"beams": beams_setting(pings.head)}
     salinity = np.unique(pings.salinity)
     if len(salinity) == 1 and np.isfinite(salinity[0]) and salinity[0] != DEFAULT_PSU and measured:
         out["sound"] = {"salinity_psu": float(salinity[0])}
@@ -252,6 +251,12 @@ def _settings(pings: Pings, sound: dict[str, Any], measured: bool) -> dict[str, 
         lat, lon = (round(float(v), 7) for v in pings.position[located[0]])
         out["environment"] = out.get("environment", {}) | {"origin_lat_deg": lat, "origin_lon_deg": lon}
     return out
+
+
+def beams_setting(head: BeamHead) -> dict[str, Any]:
+    """A configuration's ``dvl.beams``."""
+    stated: dict[str, Any] = {"angle_deg": head.angle_deg, "azimuth_deg": AZIMUTHS_DEG}
+    return stated | ({} if head.convex else {"convex": False})
 
 
 def _notes(pings: Pings) -> Iterator[str]:

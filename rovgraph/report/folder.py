@@ -21,6 +21,7 @@ from rovgraph._version import __version__
 from rovgraph.errors import InputError, warn
 
 SUMMARY, ACOUSTICS_FILE, SOUNDINGS_FILE = "summary.json", "acoustics.csv", "soundings.csv"
+CURRENT_FILE = "current.csv"
 STAMP = {  # in every summary: the folder is ours
     "program": "rovgraph",
     "version": __version__,

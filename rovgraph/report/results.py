@@ -23,12 +23,12 @@ from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.estimate import REPLY_COLUMNS, RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.inference.trajectory import TUM, Trajectory
 from rovgraph.log import Log
-from rovgraph.log.companions import beams_frame
+from rovgraph.log.companions import columns_beside
 from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config
-from rovgraph.report.folder import ACOUSTICS_FILE, SOUNDINGS_FILE, STAMP, SUMMARY
+from rovgraph.report.folder import ACOUSTICS_FILE, CURRENT_FILE, SOUNDINGS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.dvl_beam import BEAMS, error_velocity
@@ -213,6 +213,8 @@ def write_results(
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
     if len(estimates[0].replies):
         write_csv(estimates[0].replies[REPLY_COLUMNS], folder / ACOUSTICS_FILE, decimals={"time": 4})
+    if len(estimates[0].current):
+        write_csv(estimates[0].current, folder / CURRENT_FILE, decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
     _write_of_log(folder, estimates[0], log, config, frozen)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
@@ -235,7 +237,7 @@ def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
     if BEAMS in log:
         error = error_velocity(log[BEAMS].data, config.dvl)
-        frame = beams_frame(log[BEAMS])
+        frame = pd.DataFrame(columns_beside(log[BEAMS]))
         frame = frame if np.isnan(error).all() else frame.assign(error_velocity=error)
         write_csv(frame, folder / BEAMS_FILE, decimals={"time": 4})
     bottom = bottom_of(log, config, main)

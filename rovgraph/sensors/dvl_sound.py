@@ -21,6 +21,7 @@ from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER
 from rovgraph.sensors.dvl_beam import BEAMS, DVL_BEAMS, PHASED_C0, QUANTITIES, beam_sound_speed
 from rovgraph.sensors.sensor import Column, Sensor
 from rovgraph.sensors.sound import profile_of, sound_speed
+from rovgraph.sensors.water_layer import ADCP, ALONG, CELLS, EARTH, VELOCITIES
 
 DVL_SOUND = Sensor(
     "dvl_sound",
@@ -29,7 +30,7 @@ DVL_SOUND = Sensor(
     occasional=True,
     complete=lambda data: np.asarray(np.isfinite(data).any(axis=1)),
 )
-CORRECTED = tuple(sensor.name for sensor in (DVL, DVL_WATER, DVL_ALTITUDE, DVL_BEAMS))
+CORRECTED = tuple(sensor.name for sensor in (DVL, DVL_WATER, DVL_ALTITUDE, DVL_BEAMS, ADCP))
 
 
 class WaterState(NamedTuple):
@@ -98,18 +99,22 @@ class SoundCorrection:
         ratio, phased = c / c_set, self.dvl.beams.phased
         steep = np.sqrt(np.maximum(1.0 - (c / (2.0 * PHASED_C0)) ** 2, 0.0))  # cosine of the beams' angle
         down = ratio * (np.where(known, 2.0 / np.sqrt(3.0) * steep, 1.0) if phased else 1.0)
+        set_steep = np.sqrt(np.maximum(1.0 - (c_set / (2.0 * PHASED_C0)) ** 2, 0.0))
+        horizontal, vertical = (np.ones(len(c)), ratio * set_steep / steep) if phased else (ratio, ratio)
+        along = np.where(known, beam_sound_speed(self.dvl) / c_set, 1.0) if phased else ratio
         out = data.copy()
         if sensor == BEAMS:
-            along = np.where(known, beam_sound_speed(self.dvl) / c_set, 1.0) if phased else ratio
             factor = {"velocity": along, "range": ratio, "distance": down, "sd": along}
             for k, quantity in enumerate(QUANTITIES):
                 if quantity in factor:
                     out[:, k :: len(QUANTITIES)] *= factor[quantity][:, None]
         elif sensor == DVL_ALTITUDE.name:
             out[:, 0] *= down
-        elif phased:
-            set_steep = np.sqrt(np.maximum(1.0 - (c_set / (2.0 * PHASED_C0)) ** 2, 0.0))
-            out[:, 2] *= ratio * set_steep / steep
+        elif sensor == CELLS:
+            of_axes = dict(zip((*VELOCITIES, *EARTH), (horizontal, horizontal, vertical) * 2, strict=True))
+            of_cells = dict.fromkeys(("adcp_range", "adcp_cell", "adcp_bottom"), down) | {"adcp_sd": horizontal}
+            for name, factor_of_column in (of_axes | of_cells | dict.fromkeys(ALONG, along)).items():
+                out[:, ADCP.column_names.index(name)] *= factor_of_column
         else:
-            out[:, :3] *= ratio[:, None]
+            out[:, :3] *= np.column_stack([horizontal, horizontal, vertical])
         return out

@@ -90,6 +90,7 @@ ADCP = Sensor(
         Column("adcp_sd", "speed", optional=True, group="adcp_velocity"),
         *(Column(name, "angle", optional=True, group="adcp_attitude") for name in ATTITUDE),
     ),
+    may_begin_later=True,
     complete=_is_cell,
 )
 LAYER = Sensor(WATER_LAYER, (), _layer, observes=Observed("velocity"))

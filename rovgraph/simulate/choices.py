@@ -8,9 +8,10 @@ from typing import Any
 from rovgraph.errors import InputError
 
 CURRENT_MAX = 1.0  # that may be chosen [m/s]
+MOST_CELLS = 255  # of a profile
 DEEPEST_M = 11_000.0
 DURATION_MAX = 6 * 3600.0  # beyond it the log outgrows the memory [s]
-EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places", "false_places"})
+EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places", "false_places", "profiles"})
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Choices:
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of places that a camera recognises
     false_places : share of the matches that are false, from 0 to below 1
+    profiles : length of a cell [m] and number of cells of an ADCP's profiles; None = without
     noise : with noise, biases and drawn errors of vehicle and sensors
     """
 
@@ -44,6 +46,7 @@ class Choices:
     dropouts: tuple[tuple[float, float], ...] = ()
     places: tuple[tuple[float, float], ...] = ()
     false_places: float = 0.0
+    profiles: tuple[float, float] | None = None
     noise: bool = True
 
     def __post_init__(self) -> None:
@@ -59,6 +62,8 @@ class Choices:
             raise InputError(f"duration of {self.duration} s: at most {DURATION_MAX:.0f} s")
         if self.depth is not None and not 0.0 <= self.depth <= DEEPEST_M:
             raise InputError(f"depth of {self.depth} m: between 0 and {DEEPEST_M:g} m are expected")
+        if self.profiles is not None and not (self.profiles[0] > 0.0 and 1 <= self.profiles[1] <= MOST_CELLS):
+            raise InputError(f"profiles {self.profiles!r}: length and number (to {MOST_CELLS}) of cells, as (4, 25)")
         for first, last in self.dropouts:
             if not 0.0 <= first < last:
                 raise InputError(f"dropout {first:g}:{last:g}: two times in seconds are expected, as 100:130")
@@ -73,6 +78,8 @@ class Choices:
                 raise InputError(f"{name} {value!r}: a number is expected")
         if not (self.current is None or _is_pair(self.current)):
             raise InputError(f"current {self.current!r}: north and east in m/s are expected, as (0.1, -0.05)")
+        if not (self.profiles is None or _is_pair(self.profiles)):
+            raise InputError(f"profiles {self.profiles!r}: length and number of cells are expected, as (4, 25)")
         for name, example in (("dropouts", "((100, 130),)"), ("places", "((10, -5),)")):
             pairs = getattr(self, name)
             if not (isinstance(pairs, tuple | list) and all(map(_is_pair, pairs))):
@@ -82,7 +89,7 @@ class Choices:
         """Entries of ``summary.json``: the common ones always, the others where they were chosen."""
         common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
         others = {name: getattr(self, name) for name in ("variant", "current", "disturbances", "depth", "ship")}
-        others |= {name: getattr(self, name) or None for name in ("dropouts", "places", "false_places")}
+        others |= {name: getattr(self, name) or None for name in ("dropouts", "places", "false_places", "profiles")}
         return common | {name: value for name, value in others.items() if value is not None}
 
     def require(self, scenario: str, known: frozenset[str], variants: tuple[str, ...] = ()) -> None:

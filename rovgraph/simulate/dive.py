@@ -30,13 +30,14 @@ from rovgraph.inference.gyrocompassing import relies_on_gyro
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.earth import GRAVITY_PER_DEPTH, latitude_at, normal_gravity, radii
-from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS
+from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, WATER_LAYER
 from rovgraph.model.config import Config, ImuNoise, beliefs, mount_matrix
 from rovgraph.model.state import State
 from rovgraph.problem.beams import beam_contexts
 from rovgraph.sensors import SENSORS, field_direction
 from rovgraph.sensors.dvl_beam import beam_columns, beam_geometry, beam_sd, velocity_by_beams
 from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.water_layer import VELOCITIES
 from rovgraph.simulate.acoustic import AcousticSampler, has_acoustics, lay_beacons, ship_path
 from rovgraph.simulate.environment import compass_turn
 from rovgraph.simulate.path import Motion, Path
@@ -176,6 +177,8 @@ WATER_COLUMNS = ["dvl_water_vx", "dvl_water_vy", "dvl_water_vz"]
 TIME_STEP = 1e-4  # resolution of the log's clock [s]
 PASSING_STEP = 0.02  # between epochs at which it is seen whether a place is near [s]
 COMPASS_RATE = 10.0  # of compasses that only the configuration names [Hz]
+PROFILE_S, PROFILE_M = 2.0, 2.0  # between profiles, and depths that the current is drawn at
+BEAM_ANGLE = np.deg2rad(30.0)  # of an ADCP, whose side lobes see the bottom
 BOTTOM_BELOW_M = 5.0  # the deepest point of a path, for a DVL's beams
 RANGE_SD_M = 0.02  # of a beam
 AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
@@ -237,6 +240,9 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     makers = (_depths, _attitudes, _autopilot_headings, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
+    world = _world(truth)
+    if truth.profiles is not None:
+        frames.append(_profiles(sample, path, truth.profiles, world))
     if acoustic is not None:
         frames += _acoustics(sample, path, acoustic)
     log = pd.concat(frames, ignore_index=True)
@@ -248,10 +254,10 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     absent = {
         name
         for name, belief in beliefs(truth.config).items()
-        if belief.streams == () or {*belief.variable.sensors} <= missing
+        if belief.streams == () or {*belief.variable.sensors} <= missing or name in LAYERS
     }
     calibration = {name: value for name, value in calibration.items() if name not in absent}
-    hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
+    hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": world}
     hidden["lasting"] = lasting
     return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)
 
@@ -440,6 +446,39 @@ def _beams(
         columns[valid] = pd.array(np.where(lost, 0, 1), dtype="Int64")
         columns |= {velocity: np.where(lost, np.nan, b[:, k]), distance: np.where(lost, np.nan, far[:, k])}
     return velocity_by_beams(geometry.directions, b, np.ones(b.shape, bool))[0], pd.DataFrame(columns)
+
+
+def _profiles(sample: _Sampler, path: Path, cells: tuple[float, float], world: dict[str, Any]) -> pd.DataFrame:
+    """Velocities relative to the water in cells below the DVL, a row each; they end at the bottom where there is lock.
+
+    The current is the one of the calibration, with a Gauss-Markov process of depth on it, as ``water`` states it:
+    ``world`` gets that.
+    """
+    truth, water = sample.truth, sample.truth.config.water
+    motion = sample.motion(WATER_LAYER, path, sample.epochs(path, PROFILE_S))
+    far = cells[0] * np.arange(1.0, int(cells[1]) + 1.0)
+    dvl = truth.config.dvl
+    down = far * np.abs(motion.R_nb @ mount_matrix(dvl.mount_rpy_deg))[:, 2, 2:]
+    depth = motion.p_n[:, 2:] + rotate(motion.R_nb, dvl.lever_arm_m)[:, 2:] + down
+    grid = np.arange(min(float(depth.min()), 0.0), float(depth.max()) + PROFILE_M, PROFILE_M)
+    white = water.current_sd_mps * sample.noise(1.0, (len(grid), 2))
+    current = remembered(white, water.correlation_m / PROFILE_M) + sample.calibration["current"]
+    world |= {"current_depth": grid, "current_n": current}
+    model: Any = sample.instruments[WATER_LAYER].model
+    context = np.repeat(model.context, len(motion), axis=0)
+    context[:, at.SHARE] = 0.0
+    still, by = model.of(context).predict(sample.state(motion), motion.w_b)  # linear in the current
+    here = np.stack([np.interp(depth, grid, column) for column in current.T], axis=-1)
+    values = still[:, None] + np.einsum("nij,nkj->nki", by[LAYERS[0]], here)
+    values = values + sample.noise(np.array(water.cell_sd_mps), values.shape)
+    bottom = float(path.motion(np.linspace(0.0, path.duration, 500)).p_n[:, 2].max()) + BOTTOM_BELOW_M
+    lost = np.zeros(len(motion), bool)
+    for begin, end in truth.dropouts:
+        lost |= (motion.time >= begin) & (motion.time <= end)
+    seen = lost[:, None] | (depth - depth[:, :1] + far[0] < (bottom - depth[:, :1] + far[0]) * np.cos(BEAM_ANGLE))
+    time, ranges = (np.broadcast_to(x, depth.shape)[seen] for x in (motion.time[:, None], far))
+    frame = _frame(time, [*VELOCITIES], values[seen])
+    return frame.assign(adcp_range=ranges, adcp_cell=cells[0])
 
 
 def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:

@@ -458,6 +458,7 @@ class World:
             magnetism=Magnetism(iron_near(path, self.config, self.rng)) if disturbed else Magnetism(),
             outlier_share=self.choices.outliers,
             dropouts=self.choices.dropouts,
+            profiles=self.choices.profiles,
             places=self.choices.places,
             false_places=self.choices.false_places,
         )

@@ -1,8 +1,8 @@
 """A simulated dive as files.
 
 ``log.csv`` is the vehicle's recording, with ``log.dvl_beams.csv`` where the configuration says how the DVL's beams
-point, and ``config.yaml`` the estimator's configuration; ``truth.csv`` and ``truth.json`` are hidden from the
-estimator; ``summary.json`` lists the options.
+point and ``log.adcp.csv`` where it profiles the water, and ``config.yaml`` the estimator's configuration; ``truth.csv``
+and ``truth.json`` are hidden from the estimator; ``summary.json`` lists the options.
 """
 
 import json
@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.log.companions import PREFIX
+from rovgraph.log.companions import CELL_PREFIX, PREFIX
 from rovgraph.log.tables import table_beside
 from rovgraph.model.config import Config, with_priors_stated
 from rovgraph.sensors import SENSORS
 from rovgraph.sensors.dvl_beam import BEAMS
+from rovgraph.sensors.water_layer import CELLS
 from rovgraph.simulate.dive import Dive
 
 TRUTH_RATE = 10.0  # rows per second of truth.csv
@@ -47,12 +48,14 @@ def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]
     summary : entries of ``summary.json`` beside the figures of the dive
     """
     log = dive.log_frame
-    single = [name for name in map(str, log) if name.startswith(PREFIX)]
-    write_log(log.drop(columns=single), folder / "log.csv")
-    if single:
-        beams = log.loc[log[single].notna().any(axis=1), ["time", *single]]
-        beams.columns = pd.Index([str(name).removeprefix(PREFIX) for name in beams])
-        beams.round(DECIMALS["time"]).to_csv(table_beside(folder / "log.csv", BEAMS), index=False)
+    for name, prefix in ((BEAMS, PREFIX), (CELLS, CELL_PREFIX)):
+        single = [column for column in map(str, log) if column.startswith(prefix)]
+        if single:
+            beside = log.loc[log[single].notna().any(axis=1), ["time", *single]]
+            beside.columns = pd.Index([str(column).removeprefix(prefix) for column in beside])
+            beside.round(DECIMALS["time"]).to_csv(table_beside(folder / "log.csv", name), index=False)
+            log = log.drop(columns=single)
+    write_log(log.dropna(how="all", subset=[name for name in log if name != "time"]), folder / "log.csv")
     step = max(round(1.0 / (TRUTH_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
     dive.truth.every(step).write_csv(folder / "truth.csv")
     (folder / "config.yaml").write_text(known(dive, config).to_yaml(), encoding="utf-8")

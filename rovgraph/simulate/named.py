@@ -92,6 +92,7 @@ def _kinematic(path: Path, config: Config, choices: Choices, seed: int) -> Truth
         noise=choices.noise,
         outlier_share=choices.outliers,
         dropouts=choices.dropouts,
+        profiles=choices.profiles,
         places=choices.places,
         false_places=choices.false_places,
         ship=None if choices.ship is None else ship_path(choices.ship, path, np.random.default_rng([seed, 2])),

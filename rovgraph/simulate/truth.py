@@ -114,6 +114,7 @@ class Truth:
     ahrs_memory : correlation time of the errors of the unit's own attitude [s]
     outlier_share : part of the pings that are wrong
     outlier_size : sd of the error of a wrong ping, every component [m/s]
+    profiles : length of a cell [m] and number of cells of an ADCP's profiles; None = without
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of each place that a camera recognises, 1, 2, ... in the log
     place_radius : how near the camera has to come [m]
@@ -139,6 +140,7 @@ class Truth:
     ahrs_memory: float = 0.0
     outlier_share: float = 0.0
     outlier_size: float = 0.5
+    profiles: tuple[float, float] | None = None
     dropouts: tuple[tuple[float, float], ...] = ()
     places: tuple[tuple[float, float], ...] = ()
     place_radius: float = 1.0

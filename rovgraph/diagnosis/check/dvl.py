@@ -6,21 +6,27 @@ The check needs neither heading nor depth.
 from collections.abc import Iterator
 
 import numpy as np
+import pandas as pd
 
 from rovgraph.diagnosis.check.acceleration import BETTER, AccelerationFit, DvlAgainstImu, Search
 from rovgraph.diagnosis.check.agreement import dives_with_depth
 from rovgraph.diagnosis.check.clocks import Examined, compare, find_jump
-from rovgraph.diagnosis.check.findings import Finding, believed_lag
+from rovgraph.diagnosis.check.findings import Finding, believed_lag, valid_pings
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
-from rovgraph.geometry import Array, log_rotation
-from rovgraph.log import Log
+from rovgraph.geometry import Array, log_rotation, matrix_from_rpy
+from rovgraph.log import Log, Stream
 from rovgraph.log.units import UNITS
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.problem.beams import ENOUGH, ONE_PING_S, head_against_velocity, nearest
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors.dvl import axes_remedy
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
+from rovgraph.sensors.water_layer import CELLS, VELOCITIES
 
+LONGEST_LAG_S, LAG_STEP_S, SLOPE_S = 30.0, 0.5, 1.0  # of profiles against the depth, and over which it changes
+BETTER_LAG = 0.6  # of the error as it stands, that another lag or sign leaves
+BESIDE_S = 1.0  # between a profile and a ping
+AS_BOTTOM_MPS = 0.05  # between cells and bottom track
 SIMILAR = 1.1  # times the least error, up to which two orientations are not distinguished
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 APART = 0.15  # that search and fit may be apart [s]
@@ -94,6 +100,56 @@ def ranges(log: Log, config: Config) -> Iterator[Finding]:
             text = f"dvl_beam_{name}_K is {ratio:.3g} times dvl_altitude, expected {right:.3g}"
             remedy = "check their columns" if unit is None else f"state units: {{dvl_beam_range: {unit}}}"
             yield Finding(BEAMS, "warning", f"{text}: {remedy}")
+
+
+def profiles(log: Log, config: Config) -> Iterator[Finding]:
+    """Cells of the water against depth and bottom track: their clock and sign, and a bottom that nothing marks."""
+    if CELLS not in log or "depth" not in log:
+        return
+    cells, depth = log[CELLS], log["depth"]
+    velocity = np.column_stack([cells[name] for name in VELOCITIES])
+    tilt = np.nan_to_num(np.column_stack([cells["adcp_roll"], cells["adcp_pitch"], np.zeros(len(cells))]))
+    logged = np.isfinite(cells["adcp_pitch"])[:, None]
+    down_s = np.where(logged, matrix_from_rpy(tilt)[:, 2], mount_matrix(config.dvl.mount_rpy_deg)[2])
+    sinking = pd.Series((velocity * down_s).sum(axis=1)).groupby(cells.time).median().dropna()
+    time = sinking.index.to_numpy(float)
+    if len(time) < ENOUGH or len(depth) < ENOUGH:
+        return
+    lags = np.arange(-LONGEST_LAG_S, LONGEST_LAG_S + LAG_STEP_S, LAG_STEP_S)
+    at = time - lags[:, None]
+    above, below = (np.interp(at + h, depth.time, depth["depth"]) for h in (-SLOPE_S, SLOPE_S))
+    inside = (at > depth.time[0] + SLOPE_S) & (at < depth.time[-1] - SLOPE_S)
+    apart = np.where(inside, (below - above) / (2.0 * SLOPE_S) - sinking.to_numpy(), np.nan)
+    error, now = np.sqrt(np.nanmean(apart**2, axis=1)), len(lags) // 2
+    best = int(np.nanargmin(error))
+    turned = float(np.sqrt(np.nanmean((apart[now] + 2.0 * sinking.to_numpy()) ** 2)))
+    if turned < BETTER_LAG * error[now]:
+        remedy = "state units: {adcp_velocity: -m/s}"
+        yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
+    elif error[best] < BETTER_LAG * error[now]:
+        text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
+        yield Finding(CELLS, "warning", f"{text}: state delay_s.adcp, or correct them", "lag")
+    yield from _unmarked(log, cells, velocity)
+
+
+def _unmarked(log: Log, cells: Stream, velocity: Array) -> Iterator[Finding]:
+    """Whether cells beyond a range move as the bottom does, and neither altitude nor the table marks it."""
+    marked = np.isfinite(cells["adcp_bottom"]).any() or "dvl_altitude" in log
+    pings = valid_pings(log["dvl"]) if "dvl" in log and not marked else None
+    if pings is None or len(pings) < ENOUGH:
+        return
+    near = nearest(pings.time, cells.time)
+    beside = np.abs(pings.time[near] - cells.time) < BESIDE_S
+    off = np.hypot(*(velocity - pings.data[near, :3])[:, :2].T)
+    table = pd.DataFrame({"range": cells["adcp_range"], "off": off})[beside & np.isfinite(off)].groupby("range")["off"]
+    usual = table.median()[table.count() >= ENOUGH]
+    if len(usual) < 3 or not usual.max() > AS_BOTTOM_MPS * 4.0:
+        return
+    with_bottom = usual.to_numpy() < AS_BOTTOM_MPS
+    if with_bottom[-1] and not with_bottom[0]:
+        first = float(usual.index[len(usual) - int(np.argmin(with_bottom[::-1]))])
+        text = f"cells from {first:g} m on move as the bottom does, which is within their range and not marked"
+        yield Finding(CELLS, "warning", f"{text}: give the column bottom, or dvl_altitude")
 
 
 def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:

@@ -40,6 +40,8 @@ def as_dict(solution: Solution) -> dict[str, Any]:
     if s.altitude is not None:
         below = {name: getattr(s, name) for name in ("altitude", "altitude_sd", "bottom_depth", "bottom_depth_sd")}
         known |= {name: _number(value) for name, value in below.items() if value is not None}
+    if s.current:
+        known["current"] = [{name: _number(value) for name, value in at._asdict().items()} for at in s.current]
     return known | {
         "cov_north_east": _number(s.cov_north_east),
         "latitude": _number(s.latitude, decimals=9),

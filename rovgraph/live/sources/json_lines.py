@@ -1,4 +1,4 @@
-"""JSON lines with a log's columns as keys: one object per row.
+"""JSON lines with a log's columns as keys: one object per row, or per profile of the water.
 
 The configuration's names and units for a log hold for them too, so that the rows of a log, written as JSON lines, give
 the same measurements.
@@ -12,9 +12,10 @@ import pandas as pd
 from rovgraph.dates import seconds_of_texts
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.live.message import ON_EARTH, Message, readings
+from rovgraph.live.message import ON_EARTH, Message, Reading, readings
 from rovgraph.live.sources.doppler import report_message
 from rovgraph.live.sources.source import LineDecoder, Notify
+from rovgraph.log.companions import CELL_PREFIX
 from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LAT_LON, OF_GRID, SHIP_LAT_LON, STREAMS, THRUSTER, is_column, label_number, labels
@@ -24,8 +25,10 @@ from rovgraph.model.grids import lat_lon_of_grid
 from rovgraph.readers.records import Refused, json_number, json_object, shown
 from rovgraph.readers.waterlinked import is_report
 from rovgraph.sensors import SENSORS
+from rovgraph.sensors.water_layer import CELLS
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
+PROFILE = '[{"range": 4.0, "vx": 0.1, "vy": 0.0, "vz": 0.0}, ...]'
 UNKNOWN = 20  # unknown keys that are counted separately
 
 _AS_IT_IS = Scale()
@@ -83,15 +86,28 @@ class JsonRow:
         if is_report(row):  # of a Water Linked DVL, passed on as it came
             report = report_message(row, self._url, arrival, self._notify)
             return None if report is None else report._replace(clock="DVL")  # not that of the other lines
+        profile = self._profile(row.pop(CELLS, ()))
         cells = self._cells(row)
         stamp = cells.pop("time", None)
         _check(cells)
         alone = self._join(cells, stamp, arrival)
-        found = readings(cells)
+        found = readings(cells) + profile
         lost = {sensor for name in cells if (sensor := self._sensor(name))} - {r.sensor for r in found} - alone
         if lost:
             self._notify("incomplete", f"{', '.join(sorted(lost))}: not all of its columns are in the line")
         return Message(self._url, arrival, stamp, found) if found else None
+
+    def _profile(self, given: object) -> tuple[Reading, ...]:
+        """The cells of a profile, each an object with the columns of its table.
+
+        Raises
+        ------
+        Refused : something else
+        """
+        if not isinstance(given, list | tuple) or not all(isinstance(cell, dict) for cell in given):
+            raise Refused("no profile", f"{CELLS}: expected a list of cells, as {PROFILE}; the line is skipped")
+        rows = ({CELL_PREFIX + str(name): value for name, value in cell.items()} for cell in given)
+        return tuple(reading for row in rows for reading in readings(self._cells(row)))
 
     def _cells(self, row: dict[str, object]) -> dict[str, float]:
         """Columns of a row that are known and filled, in SI."""

@@ -7,11 +7,14 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.report.colours import BOTTOM, SERIES
+from rovgraph.report.folder import CURRENT_FILE
 from rovgraph.report.motion import Series, axis_limits, bottom, lower_end, motion, span, unwrapped
-from rovgraph.report.pages.page import Item, Panel, Section, Trace, broken, extremes, line, packed
+from rovgraph.report.pages.page import Item, Panel, Section, Trace, broken, extremes, line, packed, points, spread
 from rovgraph.report.pages.source import DiveSource
+from rovgraph.report.pages.track import RAMP
 from rovgraph.report.pages.uncertainty import sd_panels
 
+CELLS = 3000  # of the current that are drawn
 STRETCHES = 500  # of a series; two panels stand side by side
 SHOWN = (
     ("Depth", "depth [m]", ("depth",)),
@@ -32,7 +35,7 @@ def dive_section(source: DiveSource) -> Section:
         known = [found[name] for name in names if np.isfinite(found[name].value).any()]
         if known:
             items.append(_panel(source, title, label, known))
-    items += [*_altitude(source), *sd_panels(source)]
+    items += [*_altitude(source), *sd_panels(source), *_current(source)]
     if len(items) % 2 and isinstance(items[-1], Panel):
         items[-1] = replace(items[-1], wide=True)
     lead = ["Bands hold one standard deviation (sd) to each side. Zooming one plot zooms all of them."]
@@ -86,6 +89,27 @@ def bottom_line(source: DiveSource, found: tuple[Array, Array, Array], label: st
     some = extremes(value, stretches=STRETCHES)
     look = {"sd": packed(sd[some]), "band": 1} if np.isfinite(sd).any() else {}
     return line(label, source.clock(time[some]), value[some], BOTTOM, **look)
+
+
+def _current(source: DiveSource) -> list[Item]:
+    """The current by depth and time, as layers of the water show it: north and east in colours."""
+    found = source.frame(CURRENT_FILE, "time", "depth", "north", "east", "north_sd", "east_sd")
+    if found is None or found.empty:
+        return []
+    few = found.iloc[spread(len(found), CELLS)]
+    fastest = max(float(np.abs(found[["north", "east"]].to_numpy()).max()), 0.01)
+    drawn: list[Item] = []
+    for axis in ("north", "east"):
+        value, sd = few[axis].to_numpy(float), few[f"{axis}_sd"].to_numpy(float)
+        step = np.clip(((value / fastest + 1.0) * 0.5 * len(RAMP)).astype(int), 0, len(RAMP) - 1)
+        text = [f"{v:+.3f} ± {s:.3f} m/s at {z:.0f} m" for v, s, z in zip(value, sd, few["depth"], strict=True)]
+        colours = [RAMP[k] for k in step.tolist()]
+        look = {"size": 6, "symbol": "square", "text": text, "hoverinfo": "text", "showlegend": False}
+        trace = points(f"current {axis}", source.clock(few["time"].to_numpy(float)), few["depth"], colours, **look)
+        ramp = RAMP, f"{-fastest:.2f} m/s", f"{fastest:.2f} m/s"
+        title, axes = f"Current {axis}", (source.clock.label, "depth [m]")
+        drawn.append(Panel(title, *axes, [trace], wide=False, down=True, ramp=ramp))
+    return drawn
 
 
 def _altitude(source: DiveSource) -> list[Item]:

@@ -48,8 +48,8 @@ def line(name: str, x: ArrayLike, y: ArrayLike, colour: str, **look: Any) -> Tra
     return {"name": name, "mode": "lines", "line": style, "x": packed(x), "y": packed(y), **look}
 
 
-def points(name: str, x: ArrayLike, y: ArrayLike, colour: str, **look: Any) -> Trace:
-    """Markers; ``look`` has ``size``, ``symbol``, or keys of Plotly's trace."""
+def points(name: str, x: ArrayLike, y: ArrayLike, colour: str | Sequence[str], **look: Any) -> Trace:
+    """Markers, of one colour or one each; ``look`` has ``size``, ``symbol``, or keys of Plotly's trace."""
     style = {"color": colour, "size": look.pop("size", 4), "symbol": look.pop("symbol", "circle")}
     return {"name": name, "mode": "markers", "marker": style, "x": packed(x), "y": packed(y), **look}
 

@@ -81,6 +81,48 @@ export class Bottom {
   }
 }
 
+// North and east of the current against depth, with a band of one sd; the vehicle's depth is a line across.
+export function currentCurve(canvas, layers, depth) {
+  const [c, width, height] = blank(canvas);
+  const [left, bottom] = [38, height - 18];
+  const depths = [...layers.map((layer) => layer.depth), depth];
+  const [top, deep] = [Math.min(...depths), Math.max(...depths)];
+  const fastest = Math.max(0.05, ...layers.flatMap((layer) => [Math.abs(layer.north), Math.abs(layer.east)]));
+  const x = (value) => left + (width - left) * (0.5 + (0.45 * Math.max(-1, Math.min(1, value / fastest))));
+  const y = (value) => 6 + ((value - top) / Math.max(deep - top, 1)) * (bottom - 12);
+  c.font = "13px system-ui, sans-serif";
+  c.textBaseline = "middle";
+  c.strokeStyle = palette.grid;
+  c.fillStyle = palette.soft;
+  c.lineWidth = 1;
+  c.textAlign = "right";
+  for (const value of [top, deep]) c.fillText(`${+value.toPrecision(3)}`, left - 5, y(value));
+  c.textAlign = "center";
+  for (const value of [-fastest, 0, fastest]) c.fillText(value.toFixed(2), Math.min(x(value), width - 16), height - 7);
+  c.beginPath();
+  c.moveTo(x(0), 0);
+  c.lineTo(x(0), bottom);
+  c.moveTo(left, y(depth));
+  c.lineTo(width, y(depth));
+  c.stroke();
+  for (const [axis, dash] of [["north", []], ["east", [5, 4]]]) {
+    c.beginPath();
+    for (const layer of layers) c.lineTo(x(layer[axis] - layer[`${axis}_sd`]), y(layer.depth));
+    for (const layer of [...layers].reverse()) c.lineTo(x(layer[axis] + layer[`${axis}_sd`]), y(layer.depth));
+    c.globalAlpha = 0.15;
+    c.fillStyle = palette.sure;
+    c.fill();
+    c.globalAlpha = 1;
+    c.beginPath();
+    for (const layer of layers) c.lineTo(x(layer[axis]), y(layer.depth));
+    c.setLineDash(dash);
+    c.strokeStyle = palette.sure;
+    c.lineWidth = 2;
+    c.stroke();
+    c.setLineDash([]);
+  }
+}
+
 // Deep is below; the newest stands at the right. The bottom is dashed.
 export function depthCurve(canvas, track, now, down, bed) {
   const [c, width, height] = blank(canvas);

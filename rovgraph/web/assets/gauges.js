@@ -1,6 +1,6 @@
 // Numbers beside the map. Text reaches the page as text only.
 
-import { Bottom, depthCurve, learntCurve, rose } from "./dials.js";
+import { Bottom, currentCurve, depthCurve, learntCurve, rose } from "./dials.js";
 
 const DEG = 180 / Math.PI;
 const KNOT = 1852 / 3600; // [m/s]
@@ -77,10 +77,21 @@ export class Gauges {
     depthCurve(depth.lastChild, track, s.time, s.down, bed);
     this.gauge("gauges", "north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);
     this.gauge("gauges", "east", `${metres(s.east)} m`, `east, sd ${spread(s.east_sd)} m`);
+    this.current(s.current ?? [], s.down);
     this.gauge("gauges", "distance", `${metres(s.distance)} m`, "travelled");
     this.gauge("gauges", "clock", clock(s.time), "time of the estimate");
     this.sensors(s.sensors);
     this.learnt(s.calibration, s.time);
+  }
+
+  // By profiles of the water: at the vehicle's depth, and as a function of depth.
+  current(layers, depth) {
+    if (!layers.length) return;
+    const at = layers.reduce((best, layer) => (Math.abs(layer.depth - depth) < Math.abs(best.depth - depth) ? layer : best));
+    const to = (Math.atan2(at.east, at.north) * 180 / Math.PI + 360) % 360;
+    const label = `current at ${at.depth} m, to ${to.toFixed(0)}°, sd ${spread(Math.hypot(at.north_sd, at.east_sd))} m/s; north solid, east dashed`;
+    const found = this.gauge("gauges", "current", `${Math.hypot(at.north, at.east).toFixed(2)} m/s`, label, "", true);
+    currentCurve(found.lastChild, layers, depth);
   }
 
   lock(s) {
