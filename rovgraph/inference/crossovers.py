@@ -22,12 +22,16 @@ Rotation and scale of the whole track leave no shift where it crosses itself: cr
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
 
 from rovgraph.geometry import Array
 
@@ -41,12 +45,13 @@ STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading aroun
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
 PIECE_M = 25.0  # of a line that is run again, matched by itself
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
-MOST = 60  # soundings of either line at a crossing
-LENGTHS_M = np.geomspace(1.0, 30.0, 12)  # of relief
-NOISES = np.geomspace(1e-3, 10.0, 17)  # variance of a sounding over that of the relief
+LEAST_CELLS, MOST = 4, 60  # soundings of either line at a crossing
+LENGTHS_M = np.geomspace(1.0, 30.0, 6)  # of relief
+NOISES = np.geomspace(1e-3, 10.0, 7)  # variance of a sounding over that of the relief
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
-PLANE, SLOPE = 10.0, 0.1  # sd of a line's plane about a crossing: height over that of the relief, slope
-GRID, FINEST_M, COARSEST_M = 0.2, 0.4, 1.2  # step of a field: of the relief's length, its limits
+HEIGHT, TILT = 3.0, 0.02  # sd of a line's own height [m] and slope about a crossing: tide, depth sensor, trim
+SLOPE = 0.3  # of the bottom there, beside its relief
+GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
 SIGMAS, FARTHEST_M = 3.5, 20.0  # range of the search about what is predicted
 KEPT = 100  # combinations
 PEAK_SD = 0.3  # of a peak on the grid [m]
@@ -54,6 +59,8 @@ FALSE = 0.05  # part of crossings whose soundings are not those of the bottom
 LEAD = 10.0  # nats
 ENOUGH = 3  # crossings
 SAME_M = 2.5  # shifts closer than that are the same
+ROUNDS = 3  # of the search, each with lines where the one before has them
+SWEEPS = 6  # of expectation propagation
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 SHOWS = 1.0  # nats, of a crossing that counts
 ALIKE = 0.6  # correlation of a profile with itself further on, from which the bottom repeats itself
@@ -194,14 +201,15 @@ def fit_relief(lines: Sequence[Line]) -> Relief:
 
     unit = np.eye(STRETCH)
     none, _ = likelihood(np.broadcast_to(unit, r.shape))
-    best = Relief(0.0, 1.0, 1.0, -np.inf)
-    for length in LENGTHS_M:
-        k = _matern(r / length)
-        for noise in NOISES:
-            score, variance = likelihood(k + noise * unit)
-            if score - none > best.gain:
-                best = Relief(float(np.sqrt(variance)), length, float(np.sqrt(noise * variance)), score - none)
-    return best
+
+    def relief(log: Array) -> Relief:
+        length, noise = np.exp(log)
+        score, variance = likelihood(_matern(r / length) + noise * unit)
+        return Relief(float(np.sqrt(variance)), float(length), float(np.sqrt(noise * variance)), score - none)
+
+    start = max((np.log(pair) for pair in product(LENGTHS_M, NOISES)), key=lambda log: relief(log).gain)
+    bounds = np.log([(LENGTHS_M[0], LENGTHS_M[-1]), (NOISES[0], NOISES[-1])])
+    return relief(minimize(lambda log: -relief(log).gain, start, method="Nelder-Mead", bounds=bounds).x)
 
 
 def own_of(line: Line, cells: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -217,7 +225,7 @@ class Crossing:
     ----------
     line, earlier : numbers of the lines
     knots : when it was there, of `Drift`
-    centre : ndarray, shape (2,), north and east [m]
+    centre : ndarray, shape (2,), north and east of the earlier line there [m]
     """
 
     line: int
@@ -273,11 +281,11 @@ class Drift:
         """The mean at some times, shape (n, 2) [m]."""
         return np.stack([np.interp(time, self.time, axis) for axis in self.mean.reshape(-1, 2).T], axis=-1)
 
-    def between(self, crossings: Sequence[Crossing]) -> tuple[Array, Array]:
-        """Mean and covariance of the shifts at k crossings, shapes (2 k,) and (2 k, 2 k)."""
+    def between(self, crossings: Sequence[Crossing]) -> "Shifts":
+        """Of the errors at k crossings."""
         a, b = ((np.array([c.knots[end] for c in crossings])[:, None] * 2 + [0, 1]).ravel() for end in (0, 1))
         moved = self.P[a] - self.P[b]
-        return self.mean[a] - self.mean[b], moved[:, a] - moved[:, b]
+        return Shifts(self.mean[a] - self.mean[b], moved[:, a] - moved[:, b])
 
     def tied(self, ties: Sequence[Tie]) -> "Drift":
         """What is left when ties are known."""
@@ -289,6 +297,64 @@ class Drift:
         return Drift(self.time, self.mean + gain @ (z - J @ self.mean), 0.5 * (P + P.T))
 
 
+@dataclass
+class Shifts:
+    """Shifts at k crossings: a normal distribution.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (2 k,) [m]
+    P : ndarray, shape (2 k, 2 k) [m^2]
+    """
+
+    mean: Array
+    P: Array
+
+    def of(self, k: int) -> tuple[Array, Array]:
+        """Mean and covariance of one."""
+        own = slice(2 * k, 2 * k + 2)
+        return self.mean[own], self.P[own, own]
+
+    def take(self, which: Sequence[int] | NDArray[np.intp]) -> "Shifts":
+        """Some of them, in that order."""
+        own = (np.asarray(which)[:, None] * 2 + [0, 1]).ravel()
+        return Shifts(self.mean[own], self.P[np.ix_(own, own)])
+
+    def update(self, k: int, information: Array, pull: Array) -> None:
+        """With more information of one, and more of its product with the shift."""
+        m, V = self.of(k)
+        column = self.P[:, 2 * k : 2 * k + 2]
+        gain = column @ np.linalg.inv(np.eye(2) + information @ V)
+        self.mean = self.mean + gain @ (pull - information @ m)
+        self.P = self.P - gain @ information @ column.T
+
+    def next(self, shifts: Array, noise: float) -> tuple[Array, Array]:
+        """Of the crossing after j ones of known shifts: means, one of each row, and covariance.
+
+        Parameters
+        ----------
+        shifts : ndarray, shape (h, j, 2) [m]
+        noise : variance of each [m^2]
+        """
+        j = 2 * shifts.shape[1]
+        own, seen = slice(j, j + 2), slice(0, j)
+        gain = np.linalg.solve(self.P[seen, seen] + noise * np.eye(j), self.P[seen, own]).T
+        mean = self.mean[own] + (shifts.reshape(len(shifts), j) - self.mean[seen]) @ gain.T
+        return mean, self.P[own, own] - gain @ self.P[seen, own] + noise * np.eye(2)
+
+    def clearest_first(self) -> list[int]:
+        """Their order in which next comes what those before predict best."""
+        rest = Shifts(self.mean, self.P)
+        order: list[int] = []
+        unsure = np.zeros(len(self.mean) // 2)
+        for _ in unsure:
+            unsure[:] = np.diag(rest.P).reshape(-1, 2).sum(axis=1)
+            unsure[order] = np.inf
+            order.append(int(np.argmin(unsure)))
+            rest.update(order[-1], np.eye(2) / PEAK_SD**2, np.zeros(2))
+        return order
+
+
 @dataclass(frozen=True)
 class Crossovers:
     """What crossings of a survey's lines say.
@@ -296,36 +362,26 @@ class Crossovers:
     Attributes
     ----------
     relief : of the bottom
-    ties : of matched crossings
-    lines, matched : how many lines cross or run over three earlier pieces or more, and how many of them were matched
-    crossings : how many they have
-    refused : reason -> count of lines that were not
+    crossings : of its lines
+    ties : of those that were matched
+    refused : why nothing is used, or ""
     """
 
     relief: Relief
-    ties: list[Tie] = field(default_factory=list)
-    lines: int = 0
-    matched: int = 0
-    crossings: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
+    crossings: Sequence[Crossing] = ()
+    ties: Sequence[Tie] = ()
+    refused: str = ""
 
     @property
     def text(self) -> str:
         """One line for people."""
-        if self.ties:
-            r = self.relief
-            return (
-                f"crossovers: {self.matched} of {self.lines} lines matched with earlier ones at {len(self.ties)} of "
-                f"{self.crossings} crossings, by relief of {r.sd:.2f} m over {r.length:.1f} m"
-            )
-        if self.lines and not self.relief.shows:
-            why = f"the bottom's relief of {self.relief.sd:.2f} m is not above the noise of its soundings"
-            why = why if self.relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
-        elif self.lines:
-            why = "; ".join(f"{count} of {self.lines} lines: {why}" for why, count in self.refused.items())
-        else:
-            why = f"no line crosses, or runs again over, {ENOUGH} pieces of earlier ones"
-        return f"crossovers: nothing is used: {why}"
+        if self.refused:
+            return f"crossovers: nothing is used: {self.refused}"
+        r = self.relief
+        return (
+            f"crossovers: {len(self.ties)} of {len(self.crossings)} crossings of the survey's lines matched, by relief "
+            f"of {r.sd:.2f} m over {r.length:.1f} m"
+        )
 
 
 def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, Crossovers]":
@@ -368,47 +424,49 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
 
 
 def match(lines: Sequence[Line], drift: Drift) -> Crossovers:
-    """Match each line, as a whole, with all earlier ones.
+    """Match all crossings of a survey's lines together.
 
     Parameters
     ----------
     lines : in the order of time
     drift : of the track
     """
-    relief = fit_relief(lines)
-    out = Crossovers(relief)
-    todo = list(range(1, len(lines)))
-    counts: dict[int, int] = {}
-    reasons: dict[int, str] = {}
-    ties: list[Tie] = []
-    done: set[int] = set()
-    for _ in range(2):  # what an accepted line has tied may make an earlier one clear
-        before = len(done)
-        for k in todo:
-            if k in done:
-                continue
-            crossings = crossings_of(lines, k, drift)
-            if len(crossings) < ENOUGH:
-                continue
-            counts[k] = len(crossings)
-            if not relief.shows:
-                continue
-            found = _Search(lines, crossings, drift, relief).ties()
-            if isinstance(found, str):
-                reasons[k] = found
-                continue
-            reasons.pop(k, None)
-            done.add(k)
-            ties += found
-            drift = drift.tied(found)
-        if len(done) in (before, 0):
+    relief, track = fit_relief(lines), drift
+    for _ in range(ROUNDS):
+        crossings = [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
+        found = _match(lines, crossings, drift, relief)
+        if not found.ties:
             break
-    refused: dict[str, int] = {}
-    for why in reasons.values():
-        refused[why] = refused.get(why, 0) + 1
-    return replace(
-        out, ties=ties, lines=len(counts), matched=len(done), crossings=sum(counts.values()), refused=refused
-    )
+        before, track = track, drift.tied(found.ties)
+        if np.abs(track.mean - before.mean).max() < BESIDE_M:
+            break
+    return found
+
+
+def _match(lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief) -> Crossovers:
+    if len(crossings) < ENOUGH:
+        return Crossovers(relief, crossings, refused=f"lines cross or run again fewer than {ENOUGH} times")
+    if not relief.shows:
+        why = f"the bottom's relief of {relief.sd:.2f} m is not above the noise of its soundings"
+        why = why if relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
+        return Crossovers(relief, crossings, refused=why)
+    shifts = drift.between(crossings)
+    order = shifts.clearest_first()
+    crossings, shifts = [crossings[k] for k in order], shifts.take(order)
+    fields, found, score, reach = associate(lines, crossings, shifts, relief)
+    if (likeness := _most_alike(lines, relief, 2.0 * reach)) > ALIKE:
+        return Crossovers(relief, crossings, refused=f"the bottom repeats itself (correlation {likeness:.2f})")
+    likely = found[score > score[0] - LEAD]
+    clear = np.flatnonzero(np.linalg.norm(likely - likely[0], axis=2).max(axis=0) < SAME_M)
+    if len(clear) < ENOUGH:
+        return Crossovers(relief, crossings, refused="another match is nearly as likely")
+    knots = [crossings[k].knots for k in clear]
+    ties, gain, shown, misfit = propagate([fields[k] for k in clear], found[0, clear], shifts.take(clear), knots)
+    if gain < LEAD or shown < ENOUGH:
+        return Crossovers(relief, crossings, refused="soundings of its lines do not match")
+    if misfit > MISFIT:
+        return Crossovers(relief, crossings, refused="its soundings contradict the match")
+    return Crossovers(relief, crossings, ties)
 
 
 def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
@@ -417,8 +475,8 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
     p = p + drift.at(t)
     out = []
     for j in range(k):
-        t_b, p_b, width_b = lines[j].centre
-        p_b = p_b + drift.at(t_b)
+        t_b, own_b, width_b = lines[j].centre
+        p_b = own_b + drift.at(t_b)
         reach = float(width + width_b) + CELL_M
         low, high = p_b.min(axis=0) - reach, p_b.max(axis=0) + reach
         near = ((p >= low) & (p <= high)).all(axis=1)
@@ -433,17 +491,20 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
             for own in np.array_split(np.arange(first, last), pieces):
                 a = own[least[own].argmin()] if pieces == 1 else own[len(own) // 2]
                 b = int(apart[a].argmin())
-                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), 0.5 * (p[a] + p_b[b])))
+                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b]))
     return out
 
 
-class _Field:
-    """Log likelihood of the shift at a crossing; heights and slopes of both lines there are their own."""
+class Field:
+    """Log likelihood of the shift at a crossing over that of no common relief.
+
+    Heights and slopes of both lines there differ by what tide and trim do; the bottom's own slope is common.
+    """
 
     def __init__(self, a: tuple[Array, Array], b: tuple[Array, Array], relief: Relief) -> None:
         (self._x, z), (self._y, w), self._relief = a, b, relief
         own = [
-            relief.covariance(_apart(p, p)) + relief.noise**2 * np.eye(len(p)) + _of_plane(p, relief.sd)
+            self._common(p, p, np.zeros((1, 2)))[0] + relief.noise**2 * np.eye(len(p)) + _of_plane(p)
             for p in (self._x, self._y)
         ]
         self._own, self._z = own[0], z - z.mean()
@@ -451,8 +512,13 @@ class _Field:
         self._known = self._root @ (w - w.mean())
         self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0][0]
 
+    def _common(self, x: Array, y: Array, shifts: Array) -> Array:
+        """Covariance of the bottom's depth at places x + shift and y, shape (g, n, m)."""
+        r = np.linalg.norm((x[:, None] - y) + shifts[:, None, None], axis=-1)
+        return self._relief.covariance(r) + SLOPE**2 * x @ y.T  # of what a slope does over the shift, see heights
+
     def _likelihood(self, common: Array) -> tuple[Array, Array]:
-        """Of g covariances of the relief at both lines, and squared residuals by their number."""
+        """Of g covariances of both lines, and squared residuals by their number."""
         V = common @ self._root.T
         L = np.linalg.cholesky(self._own - V @ np.swapaxes(V, 1, 2))
         white = np.linalg.solve(L, (self._z - V @ self._known)[..., None])[..., 0]
@@ -464,157 +530,111 @@ class _Field:
         out, misfit = np.empty(len(shifts)), np.empty(len(shifts))
         for first in range(0, len(shifts), 256):
             part = slice(first, first + 256)
-            moved = self._x[None] + shifts[part, None]
-            out[part], misfit[part] = self._likelihood(self._relief.covariance(_apart(moved, self._y)))
+            out[part], misfit[part] = self._likelihood(self._common(self._x, self._y, shifts[part]))
         return out - self._none, misfit
 
 
-def _of_plane(p: Array, sd: float) -> Array:
+def _of_plane(p: Array) -> Array:
+    """Covariance of what height and slope of a line do at some places."""
     away = p - p.mean(axis=0)
-    return np.asarray((PLANE * sd) ** 2 + SLOPE**2 * away @ away.T)
+    return np.asarray(HEIGHT**2 + TILT**2 * away @ away.T)
 
 
-def _apart(x: Array, y: Array) -> Array:
-    return np.asarray(np.sqrt(((x[..., :, None, :] - y[..., None, :, :]) ** 2).sum(axis=-1)))
+def _soundings_at(lines: Sequence[Line], crossing: Crossing, predicted: Array, reach: float, relief: Relief) -> Field:
+    """The field of soundings in reach of a crossing."""
+    sides = []
+    for line, moved in ((lines[crossing.line], predicted), (lines[crossing.earlier], np.zeros(2))):
+        off = np.linalg.norm(line.place + moved - crossing.centre, axis=1)
+        own = np.argsort(off)[: np.clip((off < reach).sum(), LEAST_CELLS, MOST)]
+        sides.append((line.place[own] - crossing.centre, line.depth[own]))
+    return Field(sides[0], sides[1], relief)
 
 
-class _Search:
-    """A line against all earlier ones."""
+def associate(
+    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief
+) -> tuple[list[Field], Array, Array, float]:
+    """The best combinations of peaks of all fields, crossing by crossing.
 
-    def __init__(self, lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief) -> None:
-        self._lines, self._drift, self._relief = lines, drift, relief
-        mean, P = drift.between(crossings)
-        order = _clearest_first(P)
-        self._crossings = [crossings[k] for k in order]
-        own = (np.array(order)[:, None] * 2 + [0, 1]).ravel()
-        self._mean, self._P = mean[own], P[np.ix_(own, own)]
-        self._fields: list[_Field] = []
-        self._range = 0.0
-        self._step = float(np.clip(GRID * relief.length, FINEST_M, COARSEST_M))
+    Returns
+    -------
+    fields : of the crossings
+    shifts : ndarray, shape (h, k, 2), best first [m]
+    score : ndarray, shape (h,), their log likelihoods
+    reach : the farthest that was looked for [m]
+    """
+    step = float(np.clip(GRID * relief.length, *STEPS_M))
+    noise = PEAK_SD**2 + step**2 / 12.0
+    fields, widest = [], 0.0
+    shifts, score = np.zeros((1, 0, 2)), np.zeros(1)
+    for crossing in crossings:
+        predicted, C = prior.next(shifts, noise)
+        far = min(SIGMAS * float(np.sqrt(np.linalg.eigvalsh(C)[-1])), FARTHEST_M)
+        widest = max(widest, far)
+        spread = float(np.linalg.norm(predicted - predicted[0], axis=1).max())
+        fields.append(_soundings_at(lines, crossing, predicted[0], min(far + spread, FARTHEST_M) + BESIDE_M, relief))
+        axis = np.arange(-int(far / step) - 1, int(far / step) + 2)
+        window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        cells = np.round(predicted / step).astype(int)[:, None, None] + window
+        known, which = np.unique(cells.reshape(-1, 2), axis=0, return_inverse=True)
+        values = _robust(fields[-1].at(known * step)[0])[which.reshape(cells.shape[:3])]
+        white = np.linalg.solve(np.linalg.cholesky(C), (cells * step - predicted[:, None, None])[..., None])[..., 0]
+        both = values - 0.5 * (white**2).sum(axis=-1) - 0.5 * np.linalg.slogdet(C)[1]
+        total = np.where(_peaks(both), score[:, None, None] + both, -np.inf).ravel()
+        best = np.argsort(-total)[:KEPT]
+        best = best[total[best] > total[best[0]] - 2.5 * LEAD]
+        before = best // window[..., 0].size
+        shifts = np.concatenate([shifts[before], step * cells.reshape(-1, 1, 2)[best]], axis=1)
+        score = total[best]
+    return fields, shifts, score, widest
 
-    def ties(self) -> list[Tie] | str:
-        """What all likely combinations have in common, or why nothing is used."""
-        shifts, score = self._combinations()
-        likely = shifts[score > score[0] - LEAD]
-        spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
-        clear = np.flatnonzero(spread < SAME_M)
-        if len(clear) < ENOUGH:
-            return "another match is nearly as likely"
-        if self._repeats():
-            return "the bottom repeats itself"
-        found, gain, shown, misfit = self._propagated(shifts[0], clear)
-        if gain < LEAD or (shown > SHOWS).sum() < ENOUGH:
-            return "its soundings do not match"
-        if misfit > MISFIT:
-            return "its soundings contradict the match"
-        return found
 
-    def _field(self, k: int, predicted: Array, reach: float) -> _Field:
-        """Of a crossing, from soundings in reach of where it is predicted."""
-        c, sides = self._crossings[k], []
-        centre = c.centre - self._drift.mean.reshape(-1, 2)[c.knots[1]]  # where the earlier line's soundings have it
-        for line, moved in ((self._lines[c.line], predicted), (self._lines[c.earlier], np.zeros(2))):
-            off = np.linalg.norm(line.place + moved - centre, axis=1)
-            own = np.flatnonzero(off < reach)
-            own = own[np.argsort(off[own])[:MOST]]
-            sides.append((line.place[own] - centre, line.depth[own]))
-        return _Field(sides[0], sides[1], self._relief)
+def propagate(
+    fields: Sequence[Field], match: Array, prior: Shifts, knots: Sequence[tuple[int, int]]
+) -> tuple[list[Tie], float, int, float]:
+    """What each field about a match says beside prior and other fields, by expectation propagation (Minka 2001).
 
-    def _combinations(self) -> tuple[Array, Array]:
-        """The best combinations of shifts, shape (h, k, 2), best first, and their log likelihoods, shape (h,)."""
-        shifts, score = np.zeros((1, 0, 2)), np.zeros(1)
-        noise = PEAK_SD**2
-        for k in range(len(self._crossings)):
-            own, seen = slice(2 * k, 2 * k + 2), slice(0, 2 * k)
-            gain = np.linalg.solve(self._P[seen, seen] + noise * np.eye(2 * k), self._P[seen, own]).T
-            C = self._P[own, own] - gain @ self._P[seen, own] + noise * np.eye(2)
-            predicted = self._mean[own] + (shifts.reshape(len(shifts), -1) - self._mean[seen]) @ gain.T
-            far = min(SIGMAS * np.sqrt(np.linalg.eigvalsh(C)[-1]), FARTHEST_M)
-            self._range = max(self._range, far)
-            reach = far + np.linalg.norm(predicted - predicted[0], axis=1).clip(max=FARTHEST_M).max()
-            axis = np.arange(-np.ceil(reach / self._step), np.ceil(reach / self._step) + 1) * self._step
-            grid = predicted[0] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-            flat = grid.reshape(-1, 2)
-            near = (np.linalg.norm(flat[:, None] - predicted, axis=2) < far + self._step).any(axis=1)
-            values = np.full(len(flat), -np.inf)
-            self._fields.append(self._field(k, predicted[0], min(reach, FARTHEST_M) + BESIDE_M))
-            values[near] = _robust(self._fields[-1].at(flat[near])[0])
-            away = flat - predicted[:, None]
-            white = np.linalg.solve(np.linalg.cholesky(C), np.swapaxes(away, 1, 2))
-            both = values - 0.5 * (white**2).sum(axis=1) - 0.5 * np.linalg.slogdet(C)[1]
-            peaks = _peaks(both.reshape(len(shifts), len(axis), len(axis))).reshape(len(shifts), -1)
-            total = np.where(peaks, score[:, None] + both, -np.inf).ravel()
-            best = np.argsort(-total)[:KEPT]
-            best = best[total[best] > total[best[0]] - 2.5 * LEAD]
-            before, cell = np.divmod(best, len(flat))
-            shifts = np.concatenate([shifts[before], flat[cell][:, None]], axis=1)
-            score = total[best]
-        return shifts, score
-
-    def _repeats(self) -> bool:
-        """Whether the line, or all those that it crosses, look alike further on."""
-        earlier = [self._lines[k] for k in sorted({c.earlier for c in self._crossings})]
-        return any(
-            _most_alike(some, self._relief, 2.0 * self._range) > ALIKE
-            for some in ([self._lines[self._crossings[0].line]], earlier)
-        )
-
-    def _propagated(self, shifts: Array, clear: NDArray[np.intp]) -> tuple[list[Tie], float, Array, float]:
-        """Ties at some crossings, the log likelihood of the match, that of each crossing, and the residuals' excess."""
-        own = (clear[:, None] * 2 + [0, 1]).ravel()
-        mean, prior = self._mean[own], np.linalg.inv(self._P[np.ix_(own, own)] + 1e-4 * np.eye(len(own)))
-        axis = np.arange(-SAME_M, SAME_M + FINE_M / 2, FINE_M)
-        around = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-        grids = [shifts[k] + around for k in clear]
-        found = [self._fields[k].at(grid) for k, grid in zip(clear, grids, strict=True)]
-        values = [_robust(field) for field, _ in found]
-        count, sites = len(clear), [np.eye(2) / SAME_M**2] * len(clear)
-        pulls = [site @ shifts[k] for site, k in zip(sites, clear, strict=True)]
-        shown, misfit = np.zeros(count), np.zeros(count)
-        for _ in range(6):
-            for j in range(count):
-                part = slice(2 * j, 2 * j + 2)
-                others = prior.copy()
-                pull = prior @ mean
-                for i in range(count):
-                    if i != j:
-                        others[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += sites[i]
-                        pull[2 * i : 2 * i + 2] += pulls[i]
-                P = np.linalg.inv(others)
-                C, m = P[part, part], (P @ pull)[part]
-                away = grids[j] - m
-                inverse = np.linalg.inv(C)
-                density = values[j] - 0.5 * np.einsum("gi,ij,gj->g", away, inverse, away)
-                weight = np.exp(density - density.max())
-                weight /= weight.sum()
-                centre = weight @ grids[j]
-                spread = (grids[j] - centre).T @ ((grids[j] - centre) * weight[:, None]) + FINE_M**2 / 12.0 * np.eye(2)
-                value, axes = np.linalg.eigh(np.linalg.inv(spread) - inverse)
-                sites[j] = (axes * np.maximum(value, LEAST)) @ axes.T
-                pulls[j] = np.linalg.inv(spread) @ centre - inverse @ m if value[0] > LEAST else sites[j] @ centre
-                shown[j], misfit[j] = weight @ found[j][0], weight @ found[j][1]
-        ties = [
-            Tie(self._crossings[k].knots, np.linalg.solve(site, pull), site)
-            for k, site, pull in zip(clear, sites, pulls, strict=True)
-        ]
-        return ties, self._gain(clear, sites, pulls), shown, self._misfit(misfit, shown)
-
-    @staticmethod
-    def _misfit(misfit: Array, shown: Array) -> float:
-        return float(np.mean(misfit[shown > SHOWS])) if (shown > SHOWS).any() else 0.0
-
-    def _gain(self, clear: NDArray[np.intp], sites: Sequence[Array], pulls: Sequence[Array]) -> float:
-        """Log likelihood of the soundings with the match over that without, by Laplace's method."""
-        own = (clear[:, None] * 2 + [0, 1]).ravel()
-        P, information = self._P[np.ix_(own, own)], np.zeros((len(own), len(own)))
-        for j, site in enumerate(sites):
-            information[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] = site
-        pull = np.concatenate(pulls) - information @ self._mean[own]
-        spread = np.eye(len(own)) + P @ information
-        away = np.linalg.solve(spread, P @ pull)  # of the match from what was predicted
-        at = (self._mean[own] + away).reshape(-1, 2)
-        shown = sum(float(_robust(self._fields[k].at(shift[None])[0])[0]) for k, shift in zip(clear, at, strict=True))
-        return shown - 0.5 * float(away @ np.linalg.solve(P, away)) - 0.5 * float(np.linalg.slogdet(spread)[1])
+    Returns
+    -------
+    ties : of the crossings
+    gain : log likelihood of the soundings with the match over that without, by Laplace's method
+    shown : how many fields show it
+    misfit : squared residuals of their soundings over what is expected
+    """
+    axis = np.arange(-SAME_M, SAME_M + FINE_M / 2, FINE_M)
+    around = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    grids = match[:, None] + around
+    values, misfits = np.swapaxes([field.at(grid) for field, grid in zip(fields, grids, strict=True)], 0, 1)
+    density = _robust(values)
+    posterior, means = replace(prior), match.copy()
+    sites, pulls = np.tile(np.eye(2) / SAME_M**2, (len(fields), 1, 1)), match / SAME_M**2
+    shown, misfit = np.zeros(len(fields)), np.zeros(len(fields))
+    for k in range(len(fields)):
+        posterior.update(k, sites[k], pulls[k])
+    for k in list(range(len(fields))) * SWEEPS:
+        m, V = posterior.of(k)
+        inverse = np.linalg.inv(V)
+        others = inverse - sites[k]
+        c = np.linalg.solve(others, inverse @ m - pulls[k])
+        away = grids[k] - c
+        log = density[k] - 0.5 * np.einsum("gi,ij,gj->g", away, others, away)
+        weight = np.exp(log - log.max())
+        weight /= weight.sum()
+        means[k] = weight @ grids[k]
+        away = grids[k] - means[k]
+        spread = np.linalg.inv(away.T @ (away * weight[:, None]) + FINE_M**2 / 12.0 * np.eye(2))
+        value, axes = np.linalg.eigh(spread - others)
+        site = (axes * np.maximum(value, LEAST)) @ axes.T
+        pull = spread @ means[k] - others @ c if value[0] > LEAST else site @ means[k]
+        posterior.update(k, site - sites[k], pull - pulls[k])
+        sites[k], pulls[k] = site, pull
+        shown[k], misfit[k] = weight @ values[k], weight @ misfits[k]
+    ties = [Tie(k, np.linalg.solve(site, pull), site) for k, site, pull in zip(knots, sites, pulls, strict=True)]
+    information = block_diag(*sites)
+    spread = np.eye(len(prior.P)) + information @ prior.P
+    u = np.linalg.solve(spread, pulls.ravel() - information @ prior.mean)  # P u is the way from the prior's mean
+    gain = float(_robust(shown).sum() - 0.5 * u @ prior.P @ u - 0.5 * np.linalg.slogdet(spread)[1])
+    some = shown > SHOWS
+    return ties, gain, int(some.sum()), float(misfit[some].mean()) if some.any() else 0.0
 
 
 def _robust(field: Array) -> Array:
@@ -623,29 +643,8 @@ def _robust(field: Array) -> Array:
 
 
 def _peaks(values: Array) -> NDArray[np.bool_]:
-    """Local maxima of fields, shape (h, n, m)."""
-    wide = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    n, m = values.shape[1:]
-    out = np.isfinite(values)
-    for i in range(3):
-        for j in range(3):
-            out &= values >= wide[:, i : i + n, j : j + m]
-    return out
-
-
-def _clearest_first(P: Array) -> list[int]:
-    """An order of crossings: next comes what those before predict best."""
-    left = P.copy()
-    order: list[int] = []
-    count = len(P) // 2
-    while len(order) < count:
-        unsure = [np.inf if k in order else left[2 * k, 2 * k] + left[2 * k + 1, 2 * k + 1] for k in range(count)]
-        k = int(np.argmin(unsure))
-        order.append(k)
-        own = slice(2 * k, 2 * k + 2)
-        gain = np.linalg.solve(left[own, own] + PEAK_SD**2 * np.eye(2), left[own]).T
-        left = left - gain @ left[own]
-    return order
+    """Local maxima of h fields, shape (h, n, m)."""
+    return np.asarray(values == maximum_filter(values, (1, 3, 3), mode="nearest"))
 
 
 def _most_alike(lines: Sequence[Line], relief: Relief, far: float) -> float:
