@@ -82,7 +82,7 @@ def test_two_crossings_are_too_few():
 
 def test_a_tie_corrects_both_ends_by_what_they_are_unsure_of():
     P = np.diag([1.0, 1.0, 3.0, 3.0])
-    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).tied([Tie((1, 0), np.array([2.0, 0.0]), 1e8 * np.eye(2))])
+    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).tied([Tie((1, 0), 1e8 * np.eye(2), np.array([2e8, 0.0]))])
     assert after.mean == pytest.approx([-0.5, 0.0, 1.5, 0.0], abs=1e-6)
     assert np.diag(after.P) == pytest.approx([0.75] * 4, abs=1e-6)
 

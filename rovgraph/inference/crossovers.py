@@ -21,15 +21,14 @@ tie between two keyframes.
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
@@ -45,28 +44,24 @@ STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading aroun
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
 PIECE_M = 25.0  # of a line that is run again, matched by itself
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
-LEAST_CELLS, MOST = 4, 60  # soundings of either line at a crossing
+LEAST_CELLS, MOST = 4, 80  # soundings of either line at a crossing
 LENGTHS_M = np.geomspace(1.0, 30.0, 6)  # of relief
 NOISES = np.geomspace(1e-3, 10.0, 7)  # variance of a sounding over that of the relief
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
 HEIGHT, TILT = 3.0, 0.02  # sd of a line's own height [m] and slope about a crossing: tide, depth sensor, trim
 SLOPE = 0.3  # of the bottom there, beside its relief
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
-SIGMAS, FARTHEST_M = 3.5, 20.0  # range of the search about what is predicted
+SIGMAS, FARTHEST_M = 3.5, 40.0  # range of the search about what is predicted
 KEPT = 100  # combinations
-PEAK_SD = 0.3  # of a peak on the grid [m]
 FALSE = 0.05  # part of crossings whose soundings are not those of the bottom
 LEAD = 10.0  # nats
 ENOUGH = 3  # crossings
 SAME_M = 2.5  # shifts closer than that are the same
 ROUNDS = 3  # of the search, each with lines where the one before has them
-SWEEPS = 6  # of expectation propagation
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 SHOWS = 1.0  # nats, of a crossing that counts
 ALIKE = 0.6  # correlation of a profile with itself further on, from which the bottom repeats itself
 MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
-FINE_M = 0.25  # step of a field about its match
-LEAST = 1e-6  # information that a field may have [1/m^2]
 
 
 @dataclass(frozen=True)
@@ -236,26 +231,18 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Tie:
-    """What soundings say of the errors of a track at two knots: e(a) - e(b) = shift.
+    """What soundings say of the errors of a track at two knots, in information form.
 
     Attributes
     ----------
     knots : a, b
-    shift : ndarray, shape (2,), north and east [m]
-    information : ndarray, shape (2, 2) [1/m^2]
+    information : ndarray, shape (2, 2), of e(a) - e(b) [1/m^2]
+    pull : ndarray, shape (2,), information times shift [1/m]
     """
 
     knots: tuple[int, int]
-    shift: Array
     information: Array
-
-    def rows(self, count: int) -> tuple[Array, Array]:
-        """Whitened Jacobian by the errors of all knots, shape (2, 2 count), and right-hand side, shape (2,)."""
-        value, axes = np.linalg.eigh(self.information)
-        W = np.sqrt(np.maximum(value, 0.0))[:, None] * axes.T
-        J = np.zeros((2, count, 2))
-        J[:, self.knots[0]], J[:, self.knots[1]] = W, -W
-        return J.reshape(2, -1), W @ self.shift
+    pull: Array
 
 
 @dataclass(frozen=True)
@@ -289,15 +276,17 @@ class Drift:
 
     def tied(self, ties: Sequence[Tie]) -> "Drift":
         """What is left when ties are known."""
-        rows = [tie.rows(len(self.time)) for tie in ties]
-        J, z = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-        PJ = self.P @ J.T
-        gain = np.linalg.solve(J @ PJ + np.eye(len(z)), PJ.T).T
-        P = self.P - gain @ PJ.T
-        return Drift(self.time, self.mean + gain @ (z - J @ self.mean), 0.5 * (P + P.T))
+        mean, P = self.mean, self.P
+        for tie in ties:
+            a, b = (slice(2 * knot, 2 * knot + 2) for knot in tie.knots)
+            column = P[:, a] - P[:, b]
+            gain = column @ np.linalg.inv(np.eye(2) + tie.information @ (column[a] - column[b]))
+            mean = mean + gain @ (tie.pull - tie.information @ (mean[a] - mean[b]))
+            P = P - gain @ tie.information @ column.T
+        return Drift(self.time, mean, 0.5 * (P + P.T))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Shifts:
     """Shifts at k crossings: a normal distribution.
 
@@ -315,44 +304,12 @@ class Shifts:
         own = slice(2 * k, 2 * k + 2)
         return self.mean[own], self.P[own, own]
 
-    def take(self, which: Sequence[int] | NDArray[np.intp]) -> "Shifts":
-        """Some of them, in that order."""
-        own = (np.asarray(which)[:, None] * 2 + [0, 1]).ravel()
-        return Shifts(self.mean[own], self.P[np.ix_(own, own)])
-
-    def update(self, k: int, information: Array, pull: Array) -> None:
-        """With more information of one, and more of its product with the shift."""
+    def given(self, k: int, information: Array, pull: Array) -> "Shifts":
+        """With what soundings say of one."""
         m, V = self.of(k)
         column = self.P[:, 2 * k : 2 * k + 2]
         gain = column @ np.linalg.inv(np.eye(2) + information @ V)
-        self.mean = self.mean + gain @ (pull - information @ m)
-        self.P = self.P - gain @ information @ column.T
-
-    def next(self, shifts: Array, noise: float) -> tuple[Array, Array]:
-        """Of the crossing after j ones of known shifts: means, one of each row, and covariance.
-
-        Parameters
-        ----------
-        shifts : ndarray, shape (h, j, 2) [m]
-        noise : variance of each [m^2]
-        """
-        j = 2 * shifts.shape[1]
-        own, seen = slice(j, j + 2), slice(0, j)
-        gain = np.linalg.solve(self.P[seen, seen] + noise * np.eye(j), self.P[seen, own]).T
-        mean = self.mean[own] + (shifts.reshape(len(shifts), j) - self.mean[seen]) @ gain.T
-        return mean, self.P[own, own] - gain @ self.P[seen, own] + noise * np.eye(2)
-
-    def clearest_first(self) -> list[int]:
-        """Their order in which next comes what those before predict best."""
-        rest = Shifts(self.mean, self.P)
-        order: list[int] = []
-        unsure = np.zeros(len(self.mean) // 2)
-        for _ in unsure:
-            unsure[:] = np.diag(rest.P).reshape(-1, 2).sum(axis=1)
-            unsure[order] = np.inf
-            order.append(int(np.argmin(unsure)))
-            rest.update(order[-1], np.eye(2) / PEAK_SD**2, np.zeros(2))
-        return order
+        return Shifts(self.mean + gain @ (pull - information @ m), self.P - gain @ information @ column.T)
 
 
 @dataclass(frozen=True)
@@ -450,21 +407,18 @@ def _match(lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, r
         why = f"the bottom's relief of {relief.sd:.2f} m is not above the noise of its soundings"
         why = why if relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
         return Crossovers(relief, crossings, refused=why)
-    shifts = drift.between(crossings)
-    order = shifts.clearest_first()
-    crossings, shifts = [crossings[k] for k in order], shifts.take(order)
-    fields, found, score, reach = associate(lines, crossings, shifts, relief)
+    matches, reach = associate(lines, crossings, drift.between(crossings), relief)
     if (likeness := _most_alike(lines, relief, 2.0 * reach)) > ALIKE:
         return Crossovers(relief, crossings, refused=f"the bottom repeats itself (correlation {likeness:.2f})")
-    likely = found[score > score[0] - LEAD]
-    clear = np.flatnonzero(np.linalg.norm(likely - likely[0], axis=2).max(axis=0) < SAME_M)
-    if len(clear) < ENOUGH:
-        return Crossovers(relief, crossings, refused="another match is nearly as likely")
-    knots = [crossings[k].knots for k in clear]
-    ties, gain, shown, misfit = propagate([fields[k] for k in clear], found[0, clear], shifts.take(clear), knots)
-    if gain < LEAD or shown < ENOUGH:
+    best = matches[0]
+    if best.score < LEAD:
         return Crossovers(relief, crossings, refused="soundings of its lines do not match")
-    if misfit > MISFIT:
+    likely = np.array([m.shifts.mean for m in matches if m.score > best.score - LEAD]).reshape(-1, len(crossings), 2)
+    spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
+    ties = [tie for k, tie in best.ties.items() if spread[k] < SAME_M]
+    if len(ties) < ENOUGH:
+        return Crossovers(relief, crossings, refused="another match is nearly as likely")
+    if best.misfit > MISFIT:
         return Crossovers(relief, crossings, refused="its soundings contradict the match")
     return Crossovers(relief, crossings, ties)
 
@@ -550,101 +504,126 @@ def _soundings_at(lines: Sequence[Line], crossing: Crossing, predicted: Array, r
     return Field(sides[0], sides[1], relief)
 
 
+@dataclass(frozen=True)
+class Match:
+    """A combination of peaks, one of each field so far.
+
+    Attributes
+    ----------
+    shifts : of all crossings, with what the peaks say
+    score : log likelihood of the soundings with the match over that without
+    ties : number of a crossing -> what its peak says
+    misfits : squared residuals at the peaks, by their number
+    """
+
+    shifts: Shifts
+    score: float = 0.0
+    ties: Mapping[int, Tie] = field(default_factory=dict)
+    misfits: tuple[float, ...] = ()
+
+    @property
+    def misfit(self) -> float:
+        """Mean of those of fields that show something."""
+        return float(np.nanmean(self.misfits))
+
+    def far(self, k: int, shifts: Array) -> Array:
+        """Distances of shifts of a crossing from what is predicted [sd]."""
+        m, V = self.shifts.of(k)
+        away = shifts - m
+        return np.asarray(np.sqrt((away @ np.linalg.inv(V) * away).sum(axis=-1)))
+
+    def peaks(self, k: int, cells: Array, values: Array, misfit: Array) -> "list[tuple[float, Peak]]":
+        """Where a field puts the shift of a crossing, with the score that each place would have.
+
+        Parameters
+        ----------
+        cells : ndarray, shape (n, n, 2), shifts [m]
+        values, misfit : ndarray, shape (n, n), the field there
+        """
+        V = self.shifts.of(k)[1]
+        step = cells[1, 0, 0] - cells[0, 0, 0]
+        density = np.where(np.isfinite(values), _robust(values), -np.inf) - 0.5 * self.far(k, cells) ** 2
+        density += np.log(step**2 / (2.0 * np.pi)) - 0.5 * np.linalg.slogdet(V)[1]
+        size = 2 * int(SAME_M / step) + 1
+        tops = np.argwhere((density == maximum_filter(density, size)) & (density > density.max() - 2.0 * LEAD))
+        top = cells[tops[:, 0], tops[:, 1]]
+        flat = cells.reshape(-1, 2)
+        nearest = np.linalg.norm(flat[:, None] - top, axis=-1).argmin(axis=1)
+        out = []
+        for j in range(len(top)):
+            weight = np.where(nearest == j, np.exp(density.ravel() - density.max()), 0.0)
+            mass = weight.sum()
+            weight /= mass
+            mean = weight @ flat
+            spread = (flat - mean).T @ ((flat - mean) * weight[:, None]) + step**2 / 12.0 * np.eye(2)
+            own = weight > 0.0
+            shown = weight[own] @ values.ravel()[own] > SHOWS
+            off = float(weight[own] @ misfit.ravel()[own]) if shown else np.nan
+            out.append((self.score + float(np.log(mass) + density.max()), Peak(mean, spread, off)))
+        return out
+
+    def given(self, k: int, crossing: Crossing, score: float, peak: "Peak") -> "Match":
+        """With a peak of one more field."""
+        m, V = self.shifts.of(k)
+        before, after = np.linalg.inv(V), np.linalg.inv(peak.spread)
+        value, axes = np.linalg.eigh(after - before)
+        information = (axes * np.maximum(value, 0.0)) @ axes.T
+        pull = information @ m + (information + before) @ (peak.mean - m)
+        tie = Tie(crossing.knots, information, pull)
+        shifts = self.shifts.given(k, information, pull)
+        return Match(shifts, score, {**self.ties, k: tie}, (*self.misfits, peak.misfit))
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Of a field times what is predicted: mean [m], covariance [m^2], and squared residuals of its soundings."""
+
+    mean: Array
+    spread: Array
+    misfit: float
+
+
 def associate(
     lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief
-) -> tuple[list[Field], Array, Array, float]:
-    """The best combinations of peaks of all fields, crossing by crossing.
+) -> tuple[list[Match], float]:
+    """The best combinations of peaks, best first, and how far was looked for [m].
 
-    Returns
-    -------
-    fields : of the crossings
-    shifts : ndarray, shape (h, k, 2), best first [m]
-    score : ndarray, shape (h,), their log likelihoods
-    reach : the farthest that was looked for [m]
+    Next comes the crossing that those before predict best.
     """
     step = float(np.clip(GRID * relief.length, *STEPS_M))
-    noise = PEAK_SD**2 + step**2 / 12.0
-    fields, widest = [], 0.0
-    shifts, score = np.zeros((1, 0, 2)), np.zeros(1)
-    for crossing in crossings:
-        predicted, C = prior.next(shifts, noise)
-        far = min(SIGMAS * float(np.sqrt(np.linalg.eigvalsh(C)[-1])), FARTHEST_M)
+    matches, widest, left = [Match(prior)], 0.0, set(range(len(crossings)))
+    while left:
+        unsure = {k: np.linalg.eigvalsh(matches[0].shifts.of(k)[1])[-1] for k in left}
+        k = min(unsure, key=lambda k: unsure[k])
+        far = max(SIGMAS * float(np.sqrt(unsure[k])), SAME_M)
+        if far > FARTHEST_M:
+            break
+        left.remove(k)
         widest = max(widest, far)
+        predicted = np.array([match.shifts.of(k)[0] for match in matches])
         spread = float(np.linalg.norm(predicted - predicted[0], axis=1).max())
-        fields.append(_soundings_at(lines, crossing, predicted[0], min(far + spread, FARTHEST_M) + BESIDE_M, relief))
+        own = _soundings_at(lines, crossings[k], predicted[0], min(far + spread, FARTHEST_M) + BESIDE_M, relief)
         axis = np.arange(-int(far / step) - 1, int(far / step) + 2)
         window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
         cells = np.round(predicted / step).astype(int)[:, None, None] + window
-        known, which = np.unique(cells.reshape(-1, 2), axis=0, return_inverse=True)
-        values = _robust(fields[-1].at(known * step)[0])[which.reshape(cells.shape[:3])]
-        white = np.linalg.solve(np.linalg.cholesky(C), (cells * step - predicted[:, None, None])[..., None])[..., 0]
-        both = values - 0.5 * (white**2).sum(axis=-1) - 0.5 * np.linalg.slogdet(C)[1]
-        total = np.where(_peaks(both), score[:, None, None] + both, -np.inf).ravel()
-        best = np.argsort(-total)[:KEPT]
-        best = best[total[best] > total[best[0]] - 2.5 * LEAD]
-        before = best // window[..., 0].size
-        shifts = np.concatenate([shifts[before], step * cells.reshape(-1, 1, 2)[best]], axis=1)
-        score = total[best]
-    return fields, shifts, score, widest
-
-
-def propagate(
-    fields: Sequence[Field], match: Array, prior: Shifts, knots: Sequence[tuple[int, int]]
-) -> tuple[list[Tie], float, int, float]:
-    """What each field about a match says beside prior and other fields, by expectation propagation (Minka 2001).
-
-    Returns
-    -------
-    ties : of the crossings
-    gain : log likelihood of the soundings with the match over that without, by Laplace's method
-    shown : how many fields show it
-    misfit : squared residuals of their soundings over what is expected
-    """
-    axis = np.arange(-SAME_M, SAME_M + FINE_M / 2, FINE_M)
-    around = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    grids = match[:, None] + around
-    values, misfits = np.swapaxes([field.at(grid) for field, grid in zip(fields, grids, strict=True)], 0, 1)
-    density = _robust(values)
-    posterior, means = replace(prior), match.copy()
-    sites, pulls = np.tile(np.eye(2) / SAME_M**2, (len(fields), 1, 1)), match / SAME_M**2
-    shown, misfit = np.zeros(len(fields)), np.zeros(len(fields))
-    for k in range(len(fields)):
-        posterior.update(k, sites[k], pulls[k])
-    for k in list(range(len(fields))) * SWEEPS:
-        m, V = posterior.of(k)
-        inverse = np.linalg.inv(V)
-        others = inverse - sites[k]
-        c = np.linalg.solve(others, inverse @ m - pulls[k])
-        away = grids[k] - c
-        log = density[k] - 0.5 * np.einsum("gi,ij,gj->g", away, others, away)
-        weight = np.exp(log - log.max())
-        weight /= weight.sum()
-        means[k] = weight @ grids[k]
-        away = grids[k] - means[k]
-        spread = np.linalg.inv(away.T @ (away * weight[:, None]) + FINE_M**2 / 12.0 * np.eye(2))
-        value, axes = np.linalg.eigh(spread - others)
-        site = (axes * np.maximum(value, LEAST)) @ axes.T
-        pull = spread @ means[k] - others @ c if value[0] > LEAST else site @ means[k]
-        posterior.update(k, site - sites[k], pull - pulls[k])
-        sites[k], pulls[k] = site, pull
-        shown[k], misfit[k] = weight @ values[k], weight @ misfits[k]
-    ties = [Tie(k, np.linalg.solve(site, pull), site) for k, site, pull in zip(knots, sites, pulls, strict=True)]
-    information = block_diag(*sites)
-    spread = np.eye(len(prior.P)) + information @ prior.P
-    u = np.linalg.solve(spread, pulls.ravel() - information @ prior.mean)  # P u is the way from the prior's mean
-    gain = float(_robust(shown).sum() - 0.5 * u @ prior.P @ u - 0.5 * np.linalg.slogdet(spread)[1])
-    some = shown > SHOWS
-    return ties, gain, int(some.sum()), float(misfit[some].mean()) if some.any() else 0.0
+        inside = np.array([m.far(k, step * own) for m, own in zip(matches, cells, strict=True)]) < SIGMAS
+        known, which = np.unique(cells[inside], axis=0, return_inverse=True)
+        field = np.full((2, *inside.shape), -np.inf)
+        field[:, inside] = np.array(own.at(known * step))[:, which.reshape(-1)]
+        found = [
+            (score, peak, match)
+            for match, places, values, misfit in zip(matches, cells * step, *field, strict=True)
+            for score, peak in match.peaks(k, places, values, misfit)
+        ]
+        found.sort(key=lambda one: -one[0])
+        best = [one for one in found[:KEPT] if one[0] > found[0][0] - 2.0 * LEAD]
+        matches = [match.given(k, crossings[k], score, peak) for score, peak, match in best]
+    return matches, widest
 
 
 def _robust(field: Array) -> Array:
     """A field of soundings that may be no bottom's."""
     return np.asarray(np.logaddexp(np.log1p(-FALSE) + field, np.log(FALSE)))
-
-
-def _peaks(values: Array) -> NDArray[np.bool_]:
-    """Local maxima of h fields, shape (h, n, m)."""
-    return np.asarray(values == maximum_filter(values, (1, 3, 3), mode="nearest"))
 
 
 def _most_alike(lines: Sequence[Line], relief: Relief, far: float) -> float:
