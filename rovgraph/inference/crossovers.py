@@ -60,7 +60,7 @@ SAME_M = 2.5  # shifts closer than that are the same
 ROUNDS = 3  # of the search, each with lines where the one before has them
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 SHOWS = 1.0  # nats, of a crossing that counts
-ALIKE = 0.6  # correlation of a profile with itself further on, from which the bottom repeats itself
+REPEATS, ENOUGH_PAIRS = 0.8, 100  # rise of the correlation of lines with themselves, and cells it needs: sand waves
 MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
 
 
@@ -408,8 +408,8 @@ def _match(lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, r
         why = why if relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
         return Crossovers(relief, crossings, refused=why)
     matches, reach = associate(lines, crossings, drift.between(crossings), relief)
-    if (likeness := _most_alike(lines, relief, 2.0 * reach)) > ALIKE:
-        return Crossovers(relief, crossings, refused=f"the bottom repeats itself (correlation {likeness:.2f})")
+    if _repetition(lines, 2.0 * reach) > REPEATS:
+        return Crossovers(relief, crossings, refused="the bottom repeats itself, as sand waves do")
     best = matches[0]
     if best.score < LEAD:
         return Crossovers(relief, crossings, refused="soundings of its lines do not match")
@@ -626,25 +626,29 @@ def _robust(field: Array) -> Array:
     return np.asarray(np.logaddexp(np.log1p(-FALSE) + field, np.log(FALSE)))
 
 
-def _most_alike(lines: Sequence[Line], relief: Relief, far: float) -> float:
-    """The largest correlation of profiles with themselves, further on than relief of their length lets expect."""
-    first = int(np.ceil(max(2.0 * relief.length, 3.0 * CELL_M) / CELL_M))
-    last = int(far / CELL_M)
-    product, square, pairs = np.zeros((3, max(last + 1, 1)))
-    for line in lines:
-        for side in np.unique(line.across):
-            own = line.across == side
-            z = np.full(np.ptp(line.along) + 1, np.nan)
-            z[line.along[own] - line.along.min()] = line.depth[own]
-            known = np.flatnonzero(np.isfinite(z))
-            if len(known) < STRETCH // 2:
-                continue
-            z[known] -= np.polyval(np.polyfit(known, z[known], 1), known)
-            for lag in range(first, min(last + 1, len(z) // 2 + 1)):
-                u, v = z[:-lag], z[lag:]
-                both = np.isfinite(u) & np.isfinite(v)
-                product[lag] += u[both] @ v[both]
-                square[lag] += 0.5 * (u[both] @ u[both] + v[both] @ v[both])
-                pairs[lag] += both.sum()
-    enough = pairs > 15
-    return float((product[enough] / np.maximum(square[enough], 1e-12)).max()) if enough.any() else 0.0
+def _repetition(lines: Sequence[Line], far: float) -> float:
+    """How far the correlation of lines of one direction with themselves rises again further on."""
+    way = np.array([np.arctan2(*(line.place[-1] - line.place[0])) for line in lines])
+    direction = np.round(way / (np.pi / 4.0)).astype(int) % 4
+    lags = np.arange(1, int(far / CELL_M) + 1)
+    most = 0.0
+    for some in range(4):
+        product, square, pairs = np.zeros((3, len(lags)))
+        for line in (lines[k] for k in np.flatnonzero(direction == some)):
+            for side in np.unique(line.across):
+                own = line.across == side
+                z = np.full(np.ptp(line.along[own]) + 1, np.nan)
+                z[line.along[own] - line.along[own].min()] = line.depth[own]
+                known = np.flatnonzero(np.isfinite(z))
+                if len(known) < STRETCH // 2:
+                    continue
+                z[known] -= np.polyval(np.polyfit(known, z[known], 1), known)
+                for j, lag in enumerate(lags[lags <= len(z) // 2]):
+                    u, v = z[:-lag], z[lag:]
+                    both = np.isfinite(u) & np.isfinite(v)
+                    product[j] += u[both] @ v[both]
+                    square[j] += 0.5 * (u[both] @ u[both] + v[both] @ v[both])
+                    pairs[j] += both.sum()
+        alike = (product / np.maximum(square, 1e-12))[pairs > ENOUGH_PAIRS]
+        most = max(most, float((alike - np.minimum.accumulate(alike)).max(initial=0.0)))
+    return most
