@@ -1,21 +1,31 @@
 """Crossovers of surveys whose truth is known: wrong matches, what they gain, and their NEES.
 
-python benchmarks/crossovers.py --surveys 20
+    python benchmarks/crossovers.py --surveys 20        errors of a track and soundings, drawn
+    python benchmarks/crossovers.py --dives 3           dives of an independent simulator, through the command line
+
+A survey has 12 lines of 500 m, 25 m apart, and four crosslines, 10 m above a bottom whose relief is 1 m over 20 m.
 """
 
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from fault_campaign.beams import Beams, Bottom, stated
+from fault_campaign.campaign import merge
+from fault_campaign.instruments import sample
+from fault_campaign.judge import Dive, run_dive
+from fault_campaign.motion import Motion, Profile
+from fault_campaign.vehicle import Compass, configuration, make_vehicle
 from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
 from rovgraph.geometry import Array
 from rovgraph.inference.crossovers import Drift, lines_of, match
 
-KNOT_S = 10.0
+KNOT_S = 20.0
 WRONG_M = 3.0  # of a tie: what is left of the shift, if it is beyond 99.9 % of what the track's covariance says, too
 
 
@@ -151,7 +161,20 @@ class Case:
     tide: float = 0.0
     fish: float = 0.0
     altimeter: bool = False
+    size: tuple[int, float, float, int] = (12, 500.0, 25.0, 4)
 
+    @cached_property
+    def _covariance(self) -> tuple[Array, Array]:
+        P = self.drift.covariance(path(*self.size))
+        return P, np.linalg.cholesky(P)
+
+    def errors(self, count: int) -> tuple[Array, Array]:
+        """Covariance of the track at so many knots, and its root."""
+        P, root = self._covariance
+        return P[: 2 * count, : 2 * count], root[: 2 * count, : 2 * count]
+
+
+SMALL = 8, 250.0, 25.0, 3  # lines, their length, how far they are apart, crosslines
 
 CASES = {
     "MTi with compass": Case(MTI),
@@ -161,11 +184,11 @@ CASES = {
     "constants only": Case(CONSTANTS),
     "FOG": Case(FOG),
     "altimeter": Case(WANDER, altimeter=True),
-    "flat bottom": Case(MTI, flat),
-    "sand waves": Case(MTI, waves),
-    "other relief": Case(MTI, other_relief),
-    "fish school": Case(MTI, fish=0.15),
-    "tide": Case(MTI, tide=1.5),
+    "flat bottom": Case(MTI, flat, size=SMALL),
+    "sand waves": Case(MTI, waves, size=SMALL),
+    "other relief": Case(MTI, other_relief, size=SMALL),
+    "fish school": Case(MTI, fish=0.15, size=SMALL),
+    "tide": Case(MTI, tide=1.5, size=SMALL),
 }
 
 
@@ -183,11 +206,11 @@ class Outcome:
 
 def survey(case: Case, seed: int) -> Outcome:
     rng = np.random.default_rng([43, seed])
-    p = path()
+    p = path(*case.size)
     t = np.arange(len(p), dtype=float)
     knots = t[:: int(KNOT_S)]
-    P = case.drift.covariance(p)[: 2 * len(knots), : 2 * len(knots)]
-    e = np.linalg.cholesky(P) @ rng.standard_normal(len(P))
+    P, root = case.errors(len(knots))
+    e = root @ rng.standard_normal(len(P))
     error = np.stack([np.interp(t, knots, axis) for axis in e.reshape(-1, 2).T], axis=-1)
     terrain = case.terrain(rng)
     way = np.gradient(p, axis=0)
@@ -219,7 +242,75 @@ def survey(case: Case, seed: int) -> Outcome:
             C = after.P[np.ix_(a, a)] + after.P[np.ix_(b, b)] - after.P[np.ix_(a, b)] - after.P[np.ix_(b, a)]
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))
     rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
-    return Outcome(rms[0], rms[1], nees, len(found.ties), len(found.crossings), wrong, seconds, f"{found.text} {found.relief}")
+    return Outcome(
+        rms[0], rms[1], nees, len(found.ties), len(found.crossings), wrong, seconds, f"{found.text} {found.relief}"
+    )
+
+
+@dataclass
+class Relief(Bottom):
+    """The bottom of a terrain, for the beams of a simulated dive."""
+
+    terrain: Terrain | None = None
+
+    def at(self, north: Array, east: Array) -> tuple[Array, Array]:
+        assert self.terrain is not None
+        place, h = np.stack([north, east], axis=-1), 0.25
+        slope = [(self.terrain(place + d) - self.terrain(place - d)) / (2 * h) for d in ((h, 0.0), (0.0, h))]
+        normal = np.stack([-slope[0], -slope[1], np.ones_like(north)], axis=-1)
+        return self.terrain(place), normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> Motion:
+    """The same survey at 1 m/s, its first line to the north; turns of 90 degrees within 10 s."""
+    turn, over = 10.0, 25.0
+    beside = apart - 0.62 * turn  # of a straight between two turns
+    legs: list[tuple[float, float]] = []  # length of a straight and the turn after it
+    for k in range(lines):
+        side = 1.0 if k % 2 == 0 else -1.0
+        legs += [(length, side), (beside, side)] if k < lines - 1 else [(length, -1.0), (over, -1.0)]
+    for k in range(crosslines):
+        side = -1.0 if k % 2 == 0 else 1.0
+        legs += [(length * (0.5 if k == 0 else 1.0) / crosslines, side), (apart * (lines - 1) + 2.0 * over, -side)]
+    t, heading = 20.0, []
+    for straight, side in legs:
+        t += straight
+        heading.append((t, turn, side * np.pi / 2.0))
+        t += turn
+    surge = Profile(0.0, ((8.0, 4.0, 1.0),), ((0.005, 5.1, 0.3),))
+    still = Profile(0.0, (), ((0.003, 6.7, 1.1),))
+    return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), still, still, depth=10.0)
+
+
+def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool) -> Dive:
+    """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %."""
+    rng = np.random.default_rng([44, seed])
+    motion = survey_motion(6, 150.0, 15.0, 3) if small else survey_motion(12, 500.0, 25.0, 4)
+    vehicle = make_vehicle("mti", ("ahrs", "depth"))
+    beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
+    vehicle.dvl = replace(
+        vehicle.dvl, mount_rpy_deg=(0.0, 0.0, -45.0), yaw_sd=0.3, scale_sd=0.003, sd=beams.head.velocity_sd
+    )
+    vehicle.ahrs = Compass(offset_sd=0.5, curve_sd=0.5)
+    config = merge(configuration(vehicle), stated(beams.head))
+    config = merge(config, {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.003}}})
+    streams, hidden = sample(motion, vehicle, rng, beams)
+    return Dive(streams, config, motion, hidden)
+
+
+def print_dives(row: str, count: int, small: bool) -> None:
+    """Both ways, smoothed: rms, NEES, seconds, and what was said."""
+    for seed in range(count):
+        made = dive(CASES[row].terrain, seed, small)
+        for crossovers in (False, True):
+            begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
+            got = run_dive(replace(made, configuration=config))
+            rms, sd, nees = got.rms["smoothed"], got.sd["smoothed"], got.nees["smoothed"]["position"]
+            seconds, said = time.perf_counter() - begin, "; ".join(line for line in got.said if "crossovers:" in line)
+            how = "with" if crossovers else "without"
+            print(f"| {row} {seed} | {how} | {rms:.2f} | {sd:.2f} | {nees:.2f} | {seconds:.0f} | {said} |", flush=True)
+            if got.verdicts["smooth"] != "trusted":
+                print(*got.said, sep="\n", flush=True)
 
 
 def main() -> None:
@@ -228,12 +319,18 @@ def main() -> None:
     parser.add_argument("--surveys", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
+    parser.add_argument("--small", action="store_true", help="dives of 6 lines of 150 m")
     given = parser.parse_args()
+    if given.dives:
+        print_dives(given.rows[0], given.dives, given.small)
+        return
     for name in given.rows:
-        out = [survey(CASES[name], given.first + k) for k in range(given.surveys)]
-        if given.verbose:
-            for o in out:
-                print("   ", o)
+        out = []
+        for k in range(given.surveys):
+            out.append(survey(CASES[name], given.first + k))
+            if given.verbose:
+                print("   ", out[-1], flush=True)
         before, after = (np.sqrt(np.mean([getattr(o, n) ** 2 for o in out])) for n in ("before", "after"))
         some = [o for o in out if o.ties]
         print(
