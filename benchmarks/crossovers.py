@@ -23,6 +23,7 @@ from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
 from rovgraph.geometry import Array
+from rovgraph.inference.chart import Chart
 from rovgraph.inference.crossovers import Drift, lines_of, match
 
 KNOT_S = 20.0
@@ -112,6 +113,7 @@ class Drifting:
     heading, deviation : constants [deg]; scale
     wander, wander_s : [deg, s]
     velocity : white, of the speed over ground [m/s/rtHz]
+    start : of the first place [m]
     """
 
     heading: float = 0.0
@@ -120,6 +122,7 @@ class Drifting:
     wander: float = 0.5
     wander_s: float = 900.0
     velocity: float = 0.005
+    start: float = 0.1
 
     def covariance(self, p: Array) -> Array:
         """Of north and east at every `KNOT_S`-th place, shape (2 m, 2 m)."""
@@ -140,7 +143,7 @@ class Drifting:
         total = np.kron(np.tril(np.ones((m, m))), np.eye(2))
         P = np.zeros((2 * m + 2, 2 * m + 2))
         P[2:, 2:] = total @ steps @ total.T
-        return P + 0.01 * np.kron(np.ones((m + 1, m + 1)), np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
+        return P + self.start**2 * np.kron(np.ones((m + 1, m + 1)), np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
 
 
 MTI = Drifting(heading=0.5, deviation=0.5, scale=0.003)
@@ -149,6 +152,7 @@ WANDER = Drifting()
 SLOW = Drifting(wander=1.0, wander_s=3600.0)
 CONSTANTS = Drifting(heading=0.3, scale=0.004, wander=0.0)
 FOG = Drifting(wander=0.1, wander_s=3600.0)
+LOST = Drifting(start=50.0)
 
 
 @dataclass
@@ -162,6 +166,7 @@ class Case:
     fish: float = 0.0
     altimeter: bool = False
     size: tuple[int, float, float, int] = (12, 500.0, 25.0, 4)
+    chart: str | None = None
 
     @cached_property
     def _covariance(self) -> tuple[Array, Array]:
@@ -174,6 +179,19 @@ class Case:
         return P[: 2 * count, : 2 * count], root[: 2 * count, : 2 * count]
 
 
+def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> Chart:
+    """A chart of the bottom in cells of a metre, with errors of 0.5 m and an offset of 2 m; with something wrong."""
+    depth = terrain.depth[::2, ::2] + 2.0 + rng.normal(0.0, 0.5, terrain.depth[::2, ::2].shape)
+    if change == "upside down":
+        depth = depth[::-1]
+    elif change == "holes":
+        depth[spectrum(rng, depth.shape, 1.0, lambda k: np.exp(-((k * 8.0) ** 2))) > 0.5] = np.nan
+    elif change == "elsewhere":
+        depth = np.roll(depth, (300, 200), (0, 1))
+    return Chart(depth / 0.3048 if change == "feet" else depth, np.array(terrain.origin), 2.0 * terrain.cell, 0.5)
+
+
+LINE = 2, 250.0, 25.0, 0
 SMALL = 8, 250.0, 25.0, 3  # lines, their length, how far they are apart, crosslines
 
 CASES = {
@@ -189,6 +207,11 @@ CASES = {
     "other relief": Case(MTI, other_relief, size=SMALL),
     "fish school": Case(MTI, fish=0.15, size=SMALL),
     "tide": Case(MTI, tide=1.5, size=SMALL),
+    "chart": Case(LOST, size=LINE, chart="right"),
+    "chart with holes": Case(LOST, size=LINE, chart="holes"),
+    "chart elsewhere": Case(LOST, size=LINE, chart="elsewhere"),
+    "chart upside down": Case(LOST, size=LINE, chart="upside down"),
+    "chart in feet": Case(LOST, size=LINE, chart="feet"),
 }
 
 
@@ -229,15 +252,20 @@ def survey(case: Case, seed: int) -> Outcome:
     heading = np.arctan2(way[:, 1], way[:, 0])
     begin = time.perf_counter()
     lines = lines_of(t, heading, estimated, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
-    found = match(lines, Drift(knots, np.zeros(len(P)), P))
+    drift, chart = Drift(knots, np.zeros(len(P)), P), None
+    if case.chart is not None:
+        drift, chart = drift.beside(1e-3), charted(rng, terrain, case.chart)
+    found = match(lines, drift, chart)
     seconds = time.perf_counter() - begin
-    left = e if not found.ties else e - (after := Drift(knots, np.zeros(len(P)), P).tied(found.ties)).mean
+    after = drift.tied(found.ties)
+    left = e - after.mean[: len(e)]
     nees, wrong = np.nan, 0
     if found.ties:
         each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(knots)))]
         nees = float(np.mean([x @ np.linalg.solve(C, x) / 2 for x, C in each]))
+        off_chart = np.append(left, [0.0, 0.0])
         pairs = (np.array([tie.knots for tie in found.ties])[:, :, None] * 2 + [0, 1]).transpose(1, 0, 2)
-        off = left[pairs[0]] - left[pairs[1]]
+        off = off_chart[pairs[0]] - off_chart[pairs[1]]
         for x, (a, b) in zip(off, pairs.swapaxes(0, 1), strict=True):
             C = after.P[np.ix_(a, a)] + after.P[np.ix_(b, b)] - after.P[np.ix_(a, b)] - after.P[np.ix_(b, a)]
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))

@@ -31,18 +31,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from rovgraph.geometry import Array
+from rovgraph.model.origin import Origin
 
 if TYPE_CHECKING:
     from rovgraph.inference.bottom import Bottom
+    from rovgraph.inference.chart import Chart, ChartFile
     from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
 STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
-PIECE_M = 25.0  # of a line that is run again, matched by itself
+PIECE_M, CHART_PIECE_M = 25.0, 50.0  # of a line that is run again, or on a chart, matched by itself
+CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
 LEAST_CELLS, MOST = 4, 80  # soundings of either line at a crossing
 LENGTHS_M = np.geomspace(1.0, 30.0, 6)  # of relief
@@ -51,7 +55,7 @@ STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relie
 HEIGHT, TILT = 3.0, 0.02  # sd of a line's own height [m] and slope about a crossing: tide, depth sensor, trim
 SLOPE = 0.3  # of the bottom there, beside its relief
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
-SIGMAS, FARTHEST_M = 3.5, 40.0  # range of the search about what is predicted
+SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 KEPT = 100  # combinations
 FALSE = 0.05  # part of crossings whose soundings are not those of the bottom
 LEAD = 10.0  # nats
@@ -214,13 +218,13 @@ def own_of(line: Line, cells: NDArray[np.intp]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where a line crosses an earlier one, or runs over a piece of it again.
+    """Where a line crosses an earlier one, or runs over a piece of it again, or a piece of a line on a chart.
 
     Attributes
     ----------
-    line, earlier : numbers of the lines
+    line, earlier : numbers of the lines, `CHART` of the chart
     knots : when it was there, of `Drift`
-    centre : ndarray, shape (2,), north and east of the earlier line there [m]
+    centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
     """
 
     line: int
@@ -259,6 +263,12 @@ class Drift:
     time: Array
     mean: Array
     P: Array
+
+    def beside(self, sd: float) -> "Drift":
+        """With one more knot, never reached: the error of a chart's place, north and east."""
+        P = np.pad(self.P, (0, 2))
+        P[-2:, -2:] = max(sd, 1e-3) ** 2 * np.eye(2)
+        return Drift(np.append(self.time, np.inf), np.append(self.mean, [0.0, 0.0]), P)
 
     def knot(self, time: float) -> int:
         """The one next to a time."""
@@ -322,26 +332,33 @@ class Crossovers:
     crossings : of its lines
     ties : of those that were matched
     refused : why nothing is used, or ""
+    chart : why the chart is not, or ""
     """
 
     relief: Relief
     crossings: Sequence[Crossing] = ()
     ties: Sequence[Tie] = ()
     refused: str = ""
+    chart: str = ""
 
     @property
     def text(self) -> str:
         """One line for people."""
+        chart = f"; the chart is not used: {self.chart}" if self.chart else ""
         if self.refused:
-            return f"crossovers: nothing is used: {self.refused}"
-        r = self.relief
-        return (
-            f"crossovers: {len(self.ties)} of {len(self.crossings)} crossings of the survey's lines matched, by relief "
-            f"of {r.sd:.2f} m over {r.length:.1f} m"
+            return f"crossovers: nothing is used: {self.refused}{chart}"
+        r, knots = self.relief, {tie.knots for tie in self.ties}
+        charted, crossed = (
+            [c.knots in knots for c in self.crossings if (c.earlier == CHART) == on] for on in (True, False)
         )
+        counts = [f"{sum(crossed)} of {len(crossed)} crossings of the survey's lines"] if crossed else []
+        counts += [f"{sum(charted)} of {len(charted)} pieces on the chart"] if charted else []
+        return f"crossovers: {' and '.join(counts)} matched, by relief of {r.sd:.2f} m over {r.length:.1f} m{chart}"
 
 
-def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, Crossovers]":
+def with_crossovers(
+    estimate: "Estimate", bottom: "Bottom", chart: "ChartFile | None" = None, origin: Origin = (0.0, 0.0)
+) -> "tuple[Estimate, Crossovers]":
     """A smoothed track corrected where its soundings show its drift, and what they showed.
 
     The correction and what it leaves of the covariance are exact at the knots of the drift, and interpolated between
@@ -351,6 +368,7 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     ----------
     estimate : smoothed, with its joint covariance
     bottom : under it
+    chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
     track, posterior = estimate.trajectory, estimate.posterior
     assert posterior is not None
@@ -361,10 +379,17 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     at, place, depth = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], at, place, depth)
     drift = Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
-    found = match(lines, drift)
+    around = None
+    if chart is not None:
+        drift = drift.beside(chart.settings.position_sd_m)
+        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
+        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
+    found = match(lines, drift, around)
     if not found.ties:
         return estimate, found
     left = drift.tied(found.ties)
+    if chart is not None:
+        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
     moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
     interval = np.clip(np.searchsorted(left.time, track.time, side="right") - 1, 0, len(rate) - 1)
     p_n, v_n, cov_p = track.p_n.copy(), track.v_n.copy(), track.cov_p.copy()
@@ -380,18 +405,21 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     return replace(estimate, trajectory=corrected, posterior=None), found
 
 
-def match(lines: Sequence[Line], drift: Drift) -> Crossovers:
+def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> Crossovers:
     """Match all crossings of a survey's lines together.
 
     Parameters
     ----------
     lines : in the order of time
-    drift : of the track
+    drift : of the track; with a chart, its last knot is that of the chart
+    chart : of the same bottom
     """
     relief, track = fit_relief(lines), drift
+    off = "" if chart is None else chart.refused(lines)
+    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if chart is not None and not off else []
     for _ in range(ROUNDS):
-        crossings = [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
-        found = _match(lines, crossings, drift, relief)
+        crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
+        found = replace(_match(lines, crossings, drift, relief, chart), chart=off)
         if not found.ties:
             break
         before, track = track, drift.tied(found.ties)
@@ -400,14 +428,16 @@ def match(lines: Sequence[Line], drift: Drift) -> Crossovers:
     return found
 
 
-def _match(lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief) -> Crossovers:
+def _match(
+    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: "Chart | None"
+) -> Crossovers:
     if len(crossings) < ENOUGH:
         return Crossovers(relief, crossings, refused=f"lines cross or run again fewer than {ENOUGH} times")
     if not relief.shows:
         why = f"the bottom's relief of {relief.sd:.2f} m is not above the noise of its soundings"
         why = why if relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
         return Crossovers(relief, crossings, refused=why)
-    matches, reach = associate(lines, crossings, drift.between(crossings), relief)
+    matches, reach = associate(lines, crossings, drift.between(crossings), relief, chart)
     if _repetition(lines, 2.0 * reach) > REPEATS:
         return Crossovers(relief, crossings, refused="the bottom repeats itself, as sand waves do")
     best = matches[0]
@@ -447,6 +477,14 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
                 b = int(apart[a].argmin())
                 out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b]))
     return out
+
+
+def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
+    """Pieces of a line that are on a chart."""
+    t, p, _ = lines[k].centre
+    count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
+    middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
+    return [Crossing(k, CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a]) for a in middle]
 
 
 class Field:
@@ -494,8 +532,47 @@ def _of_plane(p: Array) -> Array:
     return np.asarray(HEIGHT**2 + TILT**2 * away @ away.T)
 
 
-def _soundings_at(lines: Sequence[Line], crossing: Crossing, predicted: Array, reach: float, relief: Relief) -> Field:
+class ChartField:
+    """As `Field`, of a piece of a line on a chart."""
+
+    def __init__(self, x: Array, z: Array, chart: "Chart", relief: Relief) -> None:
+        self._x, self._z, self._chart = x, z, chart
+        own = relief.noise**2 * np.eye(len(x)) + _of_plane(x)
+        self._root, self._spread = _whitening(own + chart.sd**2 * np.eye(len(x)))
+        root, spread = _whitening(own + relief.covariance(_apart(x)) + SLOPE**2 * x @ x.T)
+        self._none = -0.5 * float(((root @ (z - z.mean())) ** 2).sum()) - spread
+
+    def at(self, shifts: Array) -> tuple[Array, Array]:
+        """The field and squared residuals by their number at g shifts; as without a chart where it has holes."""
+        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
+        for first in range(0, len(shifts), 8192):
+            part = slice(first, first + 8192)
+            away = self._z - self._chart.at(self._x + shifts[part, None])
+            chi2 = ((away @ self._root.T) ** 2).sum(axis=1)
+            known = np.isfinite(chi2)
+            out[part] = np.where(known, -0.5 * chi2 - self._spread - self._none, 0.0)
+            misfit[part] = np.where(known, chi2 / len(self._z), 1.0)
+        return out, misfit
+
+
+def _whitening(covariance: Array) -> tuple[Array, float]:
+    """Inverse of its root, and the log of the root's determinant."""
+    L = np.linalg.cholesky(covariance)
+    return np.linalg.inv(L), float(np.log(np.diag(L)).sum())
+
+
+def _apart(x: Array) -> Array:
+    return np.asarray(np.linalg.norm(x[:, None] - x, axis=-1))
+
+
+def _soundings_at(
+    lines: Sequence[Line], crossing: Crossing, predicted: Array, reach: float, relief: Relief, chart: "Chart | None"
+) -> Field | ChartField:
     """The field of soundings in reach of a crossing."""
+    if crossing.earlier == CHART and chart is not None:
+        line = lines[crossing.line]
+        own = np.linalg.norm(line.place - crossing.centre, axis=1) < CHART_PIECE_M / 2.0
+        return ChartField(line.place[own], line.depth[own], chart, relief)
     sides = []
     for line, moved in ((lines[crossing.line], predicted), (lines[crossing.earlier], np.zeros(2))):
         off = np.linalg.norm(line.place + moved - crossing.centre, axis=1)
@@ -546,21 +623,21 @@ class Match:
         density += np.log(step**2 / (2.0 * np.pi)) - 0.5 * np.linalg.slogdet(V)[1]
         size = 2 * int(SAME_M / step) + 1
         tops = np.argwhere((density == maximum_filter(density, size)) & (density > density.max() - 2.0 * LEAD))
-        top = cells[tops[:, 0], tops[:, 1]]
-        flat = cells.reshape(-1, 2)
-        nearest = np.linalg.norm(flat[:, None] - top, axis=-1).argmin(axis=1)
-        out = []
-        for j in range(len(top)):
-            weight = np.where(nearest == j, np.exp(density.ravel() - density.max()), 0.0)
-            mass = weight.sum()
-            weight /= mass
-            mean = weight @ flat
-            spread = (flat - mean).T @ ((flat - mean) * weight[:, None]) + step**2 / 12.0 * np.eye(2)
-            own = weight > 0.0
-            shown = weight[own] @ values.ravel()[own] > SHOWS
-            off = float(weight[own] @ misfit.ravel()[own]) if shown else np.nan
-            out.append((self.score + float(np.log(mass) + density.max()), Peak(mean, spread, off)))
-        return out
+        tops = tops[np.argsort(-density[tuple(tops.T)])[:KEPT]]
+        near = density.ravel() > density.max() - 3.0 * LEAD
+        flat, weight = cells.reshape(-1, 2)[near], np.exp(density.ravel()[near] - density.max())
+        own = cKDTree(cells[tuple(tops.T)]).query(flat)[1]
+
+        def mean(x: Array) -> Array:
+            return np.asarray(np.bincount(own, weight * x, len(tops)) / mass)
+
+        mass = np.bincount(own, weight, len(tops))
+        place = np.stack([mean(x) for x in flat.T], axis=-1)
+        off = flat - place[own]
+        spread = np.array([[mean(a * b) for b in off.T] for a in off.T]).transpose(2, 0, 1) + step**2 / 12.0 * np.eye(2)
+        off = np.where(mean(values.ravel()[near]) > SHOWS, mean(misfit.ravel()[near]), np.nan)
+        score = self.score + np.log(mass) + density.max()
+        return [(float(score[j]), Peak(place[j], spread[j], float(off[j]))) for j in range(len(tops))]
 
     def given(self, k: int, crossing: Crossing, score: float, peak: "Peak") -> "Match":
         """With a peak of one more field."""
@@ -584,7 +661,7 @@ class Peak:
 
 
 def associate(
-    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief
+    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: "Chart | None"
 ) -> tuple[list[Match], float]:
     """The best combinations of peaks, best first, and how far was looked for [m].
 
@@ -596,13 +673,15 @@ def associate(
         unsure = {k: np.linalg.eigvalsh(matches[0].shifts.of(k)[1])[-1] for k in left}
         k = min(unsure, key=lambda k: unsure[k])
         far = max(SIGMAS * float(np.sqrt(unsure[k])), SAME_M)
-        if far > FARTHEST_M:
+        most = CHART_M if crossings[k].earlier == CHART else FARTHEST_M
+        if far > most:
             break
         left.remove(k)
         widest = max(widest, far)
         predicted = np.array([match.shifts.of(k)[0] for match in matches])
         spread = float(np.linalg.norm(predicted - predicted[0], axis=1).max())
-        own = _soundings_at(lines, crossings[k], predicted[0], min(far + spread, FARTHEST_M) + BESIDE_M, relief)
+        reach = min(far + spread, FARTHEST_M) + BESIDE_M
+        own = _soundings_at(lines, crossings[k], predicted[0], reach, relief, chart)
         axis = np.arange(-int(far / step) - 1, int(far / step) + 2)
         window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
         cells = np.round(predicted / step).astype(int)[:, None, None] + window

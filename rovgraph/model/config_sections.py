@@ -588,6 +588,14 @@ class Graph(ConfigSection):
         return max(0.25 * self.max_gap_s, self.min_gap_s)
 
 
+class ChartSettings(ConfigSection):
+    """A chart of the bottom, with which soundings of `graph.crossovers` are compared too."""
+
+    file: str | None = Field(None, description="GeoTIFF of depths or heights in metres, its first band")
+    sd_m: Positive = Field(0.5, description="error of a cell's depth, beside an offset of all")
+    position_sd_m: NotNegative = Field(1.0, description="how far the chart as a whole may be off, north and east")
+
+
 def _stamped(sensor: str) -> str:
     """Refuses what is no sensor, among them those that are registered."""
     known = (*STAMPED, *RegisteredSensors.model_fields)
