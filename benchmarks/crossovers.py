@@ -306,8 +306,8 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
         heading.append((t, turn, side * np.pi / 2.0))
         t += turn
     surge = Profile(0.0, ((8.0, 4.0, 1.0),), ((0.005, 5.1, 0.3),))
-    still = Profile(0.0, (), ((0.003, 6.7, 1.1),))
-    return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), still, still, depth=10.0)
+    still, level = Profile(0.0, (), ((0.003, 6.7, 1.1),)), Profile(0.0, (), ((2e-4, 5.9, 0.7),))
+    return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), level, level, depth=10.0)
 
 
 def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool) -> Dive:
@@ -319,6 +319,7 @@ def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bo
     vehicle.dvl = replace(
         vehicle.dvl, mount_rpy_deg=(0.0, 0.0, -45.0), yaw_sd=0.3, scale_sd=0.003, sd=beams.head.velocity_sd
     )
+    vehicle.dvl.rate, vehicle.imu.rate = 2.0, 50.0
     vehicle.ahrs = Compass(offset_sd=0.5, curve_sd=0.5)
     config = merge(configuration(vehicle), stated(beams.head))
     config = merge(config, {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.003}}})

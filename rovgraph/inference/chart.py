@@ -16,11 +16,13 @@ from rovgraph.model.config_sections import ChartSettings
 from rovgraph.model.origin import Origin, lat_lon
 
 if TYPE_CHECKING:
-    from rovgraph.inference.crossovers import Line
+    from rovgraph.inference.crossovers import Line, Relief
 
 MOST_CELLS = 100_000_000  # of a file
 MOST_AROUND = 4_000_000  # about a track; where there are more, they are taken wider
 FOOT = 0.3048  # [m]
+SLOWLY_M = 15.0  # sd of the filter whose outcome varies slowly
+FAR = 0.95  # share of cells without holes, about one by the relief's length, of a depth that is used
 OFF_M = 9.0  # depths that differ more in the mean are of another place or datum
 
 
@@ -91,6 +93,28 @@ class Chart:
         cells = np.moveaxis((place - self.corner) / self.step, -1, 0)
         return np.asarray(map_coordinates(self.depth, cells, order=1, cval=np.nan))
 
+    def smoothed(self, relief: "Relief") -> "SmoothedChart":
+        """The bottom as the chart shows it, by kriging: relief is normal about what varies slowly.
+
+        The errors are those far from holes; what is near one is left out.
+        """
+        from scipy.ndimage import gaussian_filter
+
+        shape = tuple(2 * n for n in self.depth.shape)
+        away = np.hypot(*np.meshgrid(*(self.step * n * np.abs(np.fft.fftfreq(n)) for n in shape), indexing="ij"))
+        S = np.fft.rfft2(relief.covariance(away)).real.clip(min=0.0)
+        known = np.isfinite(self.depth)
+        wide = SLOWLY_M / self.step
+        share = gaussian_filter(known.astype(float), wide, mode="nearest")
+        slow = gaussian_filter(np.where(known, self.depth, 0.0), wide, mode="nearest") / np.maximum(share, 1e-6)
+        rest = np.where(known, self.depth - slow, 0.0)
+        mirrored = np.concatenate([rest, rest[::-1]])
+        mirrored = np.concatenate([mirrored, mirrored[:, ::-1]], axis=1)
+        shown = np.fft.irfft2(np.fft.rfft2(mirrored) * S / (S + self.sd**2), shape)[: len(rest), : rest.shape[1]]
+        error = np.fft.irfft2(S * self.sd**2 / (S + self.sd**2), shape)[0, : rest.shape[1]]
+        far = gaussian_filter(known.astype(float), relief.length / self.step, mode="nearest") > FAR
+        return SmoothedChart(np.where(known & far, slow + shown, np.nan), self.corner, self.step, self.sd, error)
+
     def refused(self, lines: "list[Line]") -> str:
         """Why soundings along a track cannot be of this chart, or ""."""
         place = np.concatenate([line.place for line in lines])
@@ -104,6 +128,22 @@ class Chart:
         if abs(charted - sounded) > OFF_M:
             return f"it has {charted:.0f} m where soundings have {sounded:.0f} m: another place or datum"
         return ""
+
+
+@dataclass(frozen=True)
+class SmoothedChart(Chart):
+    """A chart whose errors are correlated.
+
+    Attributes
+    ----------
+    error : ndarray, shape (m,), covariance of two depths 0, 1, ... steps apart [m^2]
+    """
+
+    error: Array
+
+    def covariance(self, r: Array) -> Array:
+        """Of the errors of depths some distances apart."""
+        return np.interp(r, self.step * np.arange(len(self.error)), self.error)
 
 
 def read_chart(settings: ChartSettings, origin: Origin | None) -> ChartFile | None:

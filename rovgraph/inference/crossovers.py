@@ -38,7 +38,7 @@ from rovgraph.model.origin import Origin
 
 if TYPE_CHECKING:
     from rovgraph.inference.bottom import Bottom
-    from rovgraph.inference.chart import Chart, ChartFile
+    from rovgraph.inference.chart import Chart, ChartFile, SmoothedChart
     from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
@@ -63,6 +63,7 @@ ENOUGH = 3  # crossings
 SAME_M = 2.5  # shifts closer than that are the same
 ROUNDS = 3  # of the search, each with lines where the one before has them
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
+BETWEEN_M = 0.02  # sd of the drift between them
 SHOWS = 1.0  # nats, of a crossing that counts
 REPEATS, ENOUGH_PAIRS = 0.8, 100  # rise of the correlation of lines with themselves, and cells it needs: sand waves
 MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
@@ -282,7 +283,7 @@ class Drift:
         """Of the errors at k crossings."""
         a, b = ((np.array([c.knots[end] for c in crossings])[:, None] * 2 + [0, 1]).ravel() for end in (0, 1))
         moved = self.P[a] - self.P[b]
-        return Shifts(self.mean[a] - self.mean[b], moved[:, a] - moved[:, b])
+        return Shifts(self.mean[a] - self.mean[b], moved[:, a] - moved[:, b] + BETWEEN_M**2 * np.eye(len(a)))
 
     def tied(self, ties: Sequence[Tie]) -> "Drift":
         """What is left when ties are known."""
@@ -416,10 +417,11 @@ def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> 
     """
     relief, track = fit_relief(lines), drift
     off = "" if chart is None else chart.refused(lines)
-    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if chart is not None and not off else []
+    known = None if chart is None or off else chart.smoothed(relief)
+    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if known is not None else []
     for _ in range(ROUNDS):
         crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
-        found = replace(_match(lines, crossings, drift, relief, chart), chart=off)
+        found = replace(_match(lines, crossings, drift, relief, known), chart=off)
         if not found.ties:
             break
         before, track = track, drift.tied(found.ties)
@@ -429,7 +431,7 @@ def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> 
 
 
 def _match(
-    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: "Chart | None"
+    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: "SmoothedChart | None"
 ) -> Crossovers:
     if len(crossings) < ENOUGH:
         return Crossovers(relief, crossings, refused=f"lines cross or run again fewer than {ENOUGH} times")
@@ -535,11 +537,12 @@ def _of_plane(p: Array) -> Array:
 class ChartField:
     """As `Field`, of a piece of a line on a chart."""
 
-    def __init__(self, x: Array, z: Array, chart: "Chart", relief: Relief) -> None:
+    def __init__(self, x: Array, z: Array, chart: "SmoothedChart", relief: Relief) -> None:
         self._x, self._z, self._chart = x, z, chart
         own = relief.noise**2 * np.eye(len(x)) + _of_plane(x)
-        self._root, self._spread = _whitening(own + chart.sd**2 * np.eye(len(x)))
-        root, spread = _whitening(own + relief.covariance(_apart(x)) + SLOPE**2 * x @ x.T)
+        r = np.linalg.norm(x[:, None] - x, axis=-1)
+        self._root, self._spread = _whitening(own + chart.covariance(r))
+        root, spread = _whitening(own + relief.covariance(r) + SLOPE**2 * (x - x.mean(axis=0)) @ (x - x.mean(axis=0)).T)
         self._none = -0.5 * float(((root @ (z - z.mean())) ** 2).sum()) - spread
 
     def at(self, shifts: Array) -> tuple[Array, Array]:
@@ -561,12 +564,13 @@ def _whitening(covariance: Array) -> tuple[Array, float]:
     return np.linalg.inv(L), float(np.log(np.diag(L)).sum())
 
 
-def _apart(x: Array) -> Array:
-    return np.asarray(np.linalg.norm(x[:, None] - x, axis=-1))
-
-
 def _soundings_at(
-    lines: Sequence[Line], crossing: Crossing, predicted: Array, reach: float, relief: Relief, chart: "Chart | None"
+    lines: Sequence[Line],
+    crossing: Crossing,
+    predicted: Array,
+    reach: float,
+    relief: Relief,
+    chart: "SmoothedChart | None",
 ) -> Field | ChartField:
     """The field of soundings in reach of a crossing."""
     if crossing.earlier == CHART and chart is not None:
@@ -661,7 +665,7 @@ class Peak:
 
 
 def associate(
-    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: "Chart | None"
+    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: "SmoothedChart | None"
 ) -> tuple[list[Match], float]:
     """The best combinations of peaks, best first, and how far was looked for [m].
 
