@@ -164,6 +164,7 @@ class Case:
     noise: float = 0.14
     tide: float = 0.0
     fish: float = 0.0
+    dense: bool = False
     altimeter: bool = False
     size: tuple[int, float, float, int] = (12, 500.0, 25.0, 4)
     chart: str | None = None
@@ -206,6 +207,7 @@ CASES = {
     "sand waves": Case(MTI, waves, size=SMALL),
     "other relief": Case(MTI, other_relief, size=SMALL),
     "fish school": Case(MTI, fish=0.15, size=SMALL),
+    "dense fish school": Case(MTI, fish=0.15, dense=True, size=SMALL),
     "tide": Case(MTI, tide=1.5, size=SMALL),
     "chart": Case(LOST, size=LINE, chart="right"),
     "chart with holes": Case(LOST, size=LINE, chart="holes"),
@@ -246,7 +248,7 @@ def survey(case: Case, seed: int) -> Outcome:
     depth += case.tide * np.sin(2.0 * np.pi * t / 10000.0)[:, None]
     if case.fish:
         inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
-        depth -= inside[:, None] * rng.uniform(0.0, 4.0, depth.shape)
+        depth -= inside[:, None] * (2.0 if case.dense else rng.uniform(0.0, 4.0, depth.shape))
     estimated = p - error
     place = estimated[:, None] + arm
     heading = np.arctan2(way[:, 1], way[:, 0])

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
+SCATTER = 4.0  # sd of a cell's soundings over what is usual, from which they are no bottom's: fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
 STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
@@ -51,12 +52,14 @@ BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that 
 LEAST_CELLS, MOST = 4, 80  # soundings of either line at a crossing
 LENGTHS_M = np.geomspace(1.0, 30.0, 6)  # of relief
 NOISES = np.geomspace(1e-3, 10.0, 7)  # variance of a sounding over that of the relief
+AVERAGED = [(0.0, 2 / 3), (-CELL_M / 2**0.5, 1 / 6), (CELL_M / 2**0.5, 1 / 6)]  # of two cells: how far apart, weight
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
 HEIGHT, TILT = 3.0, 0.02  # sd of a line's own height [m] and slope about a crossing: tide, depth sensor, trim
 SLOPE = 0.3  # of the bottom there, beside its relief
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
 SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 KEPT = 100  # combinations
+SEEN = 0.5  # share of a piece's soundings that a chart must have
 FALSE = 0.05  # part of crossings whose soundings are not those of the bottom
 LEAD = 10.0  # nats
 ENOUGH = 3  # crossings
@@ -79,6 +82,7 @@ class Line:
     along, across : ndarray of int, shape (n,), of each cell
     place : ndarray, shape (n, 2), north and east [m]
     depth : ndarray, shape (n,) [m]
+    noise : sd of a depth by the scatter of its soundings [m]
     """
 
     time: Array
@@ -86,6 +90,7 @@ class Line:
     across: NDArray[np.int64]
     place: Array
     depth: Array
+    noise: float = 0.0
 
     @cached_property
     def centre(self) -> tuple[Array, Array, Array]:
@@ -139,9 +144,13 @@ def _cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
-    mean = mean[count >= 0.25 * np.median(count)] if len(count) else mean
+    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count)) / np.maximum(count - 1, 1)
+    usual = float(np.median(square[count > 1])) if (count > 1).any() else 0.0
+    good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
+    noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
+    mean = mean[good]
     along, across = np.round(mean[:, 1:3].T).astype(np.int64)
-    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5])
+    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise)
 
 
 @dataclass(frozen=True)
@@ -204,12 +213,14 @@ def fit_relief(lines: Sequence[Line]) -> Relief:
 
     def relief(log: Array) -> Relief:
         length, noise = np.exp(log)
-        score, variance = likelihood(_matern(r / length) + noise * unit)
+        k = sum(w * _matern(np.abs(r + off) / length) for off, w in AVERAGED)
+        score, variance = likelihood(k + noise * unit)
         return Relief(float(np.sqrt(variance)), float(length), float(np.sqrt(noise * variance)), score - none)
 
     start = max((np.log(pair) for pair in product(LENGTHS_M, NOISES)), key=lambda log: relief(log).gain)
     bounds = np.log([(LENGTHS_M[0], LENGTHS_M[-1]), (NOISES[0], NOISES[-1])])
-    return relief(minimize(lambda log: -relief(log).gain, start, method="Nelder-Mead", bounds=bounds).x)
+    best = relief(minimize(lambda log: -relief(log).gain, start, method="Nelder-Mead", bounds=bounds).x)
+    return replace(best, noise=max(best.noise, float(np.median([line.noise for line in lines]))))
 
 
 def own_of(line: Line, cells: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -334,6 +345,7 @@ class Crossovers:
     ties : of those that were matched
     refused : why nothing is used, or ""
     chart : why the chart is not, or ""
+    misfit : squared residuals over what is expected, where they contradict a match
     """
 
     relief: Relief
@@ -341,6 +353,7 @@ class Crossovers:
     ties: Sequence[Tie] = ()
     refused: str = ""
     chart: str = ""
+    misfit: float = 0.0
 
     @property
     def text(self) -> str:
@@ -422,6 +435,9 @@ def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> 
     for _ in range(ROUNDS):
         crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
         found = replace(_match(lines, crossings, drift, relief, known), chart=off)
+        if found.misfit > MISFIT:
+            relief = replace(relief, noise=relief.noise * found.misfit)  # or relief that its model does not describe
+            continue
         if not found.ties:
             break
         before, track = track, drift.tied(found.ties)
@@ -451,7 +467,8 @@ def _match(
     if len(ties) < ENOUGH:
         return Crossovers(relief, crossings, refused="another match is nearly as likely")
     if best.misfit > MISFIT:
-        return Crossovers(relief, crossings, refused="its soundings contradict the match")
+        why = "its soundings contradict the match"
+        return Crossovers(relief, crossings, refused=why, misfit=best.misfit)
     return Crossovers(relief, crossings, ties)
 
 
@@ -535,33 +552,34 @@ def _of_plane(p: Array) -> Array:
 
 
 class ChartField:
-    """As `Field`, of a piece of a line on a chart."""
+    """As `Field`, of a piece of a line on a chart; soundings in its holes do not count."""
 
     def __init__(self, x: Array, z: Array, chart: "SmoothedChart", relief: Relief) -> None:
         self._x, self._z, self._chart = x, z, chart
         own = relief.noise**2 * np.eye(len(x)) + _of_plane(x)
-        r = np.linalg.norm(x[:, None] - x, axis=-1)
-        self._root, self._spread = _whitening(own + chart.covariance(r))
-        root, spread = _whitening(own + relief.covariance(r) + SLOPE**2 * (x - x.mean(axis=0)) @ (x - x.mean(axis=0)).T)
-        self._none = -0.5 * float(((root @ (z - z.mean())) ** 2).sum()) - spread
+        r, away = np.linalg.norm(x[:, None] - x, axis=-1), x - x.mean(axis=0)
+        self._known, self._alone = own + chart.covariance(r), own + relief.covariance(r) + SLOPE**2 * away @ away.T
 
     def at(self, shifts: Array) -> tuple[Array, Array]:
-        """The field and squared residuals by their number at g shifts; as without a chart where it has holes."""
-        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
-        for first in range(0, len(shifts), 8192):
-            part = slice(first, first + 8192)
-            away = self._z - self._chart.at(self._x + shifts[part, None])
-            chi2 = ((away @ self._root.T) ** 2).sum(axis=1)
-            known = np.isfinite(chi2)
-            out[part] = np.where(known, -0.5 * chi2 - self._spread - self._none, 0.0)
-            misfit[part] = np.where(known, chi2 / len(self._z), 1.0)
+        """The field and squared residuals by their number at g shifts, shape (g,) each."""
+        off = self._z - self._chart.at(self._x + shifts[:, None])
+        seen = np.isfinite(off)
+        out, misfit, every = np.zeros(len(shifts)), np.ones(len(shifts)), seen.all(axis=1)
+        some = np.flatnonzero(~every & (seen.mean(axis=1) > SEEN))
+        for part in (np.flatnonzero(every), *np.array_split(some, len(some) // 512 + 1)):
+            use = seen[part] if len(part) and not every[part[0]] else seen[part[:1]]  # with all, of all shifts the same
+            with_chart, chi2 = _log_normal(self._known, np.where(seen[part], off[part], 0.0), use)
+            alone, _ = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
+            out[part], misfit[part] = with_chart - alone, chi2 / seen[part].sum(axis=1)
         return out, misfit
 
 
-def _whitening(covariance: Array) -> tuple[Array, float]:
-    """Inverse of its root, and the log of the root's determinant."""
-    L = np.linalg.cholesky(covariance)
-    return np.linalg.inv(L), float(np.log(np.diag(L)).sum())
+def _log_normal(covariance: Array, off: Array, use: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Log densities of residuals that are used, shape (g, n), without their constant, and squares of the white ones."""
+    L = np.linalg.cholesky(np.where(use[:, :, None] & use[:, None], covariance, np.eye(len(covariance))))
+    white = (np.linalg.inv(L) @ off[..., None])[..., 0] if len(L) == 1 else np.linalg.solve(L, off[..., None])[..., 0]
+    chi2 = (white**2).sum(axis=-1)
+    return -0.5 * chi2 - np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1), chi2
 
 
 def _soundings_at(
