@@ -329,9 +329,9 @@ def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bo
     return Dive(streams, config, motion, hidden)
 
 
-def print_dives(row: str, count: int, small: bool) -> None:
+def print_dives(row: str, seeds: range, small: bool) -> None:
     """Both ways, smoothed: rms, NEES, seconds, and what was said."""
-    for seed in range(count):
+    for seed in seeds:
         made = dive(CASES[row].terrain, seed, small)
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
@@ -354,7 +354,7 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="dives of 6 lines of 150 m")
     given = parser.parse_args()
     if given.dives:
-        print_dives(given.rows[0], given.dives, given.small)
+        print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small)
         return
     for name in given.rows:
         out = []

@@ -237,12 +237,14 @@ class Crossing:
     line, earlier : numbers of the lines, `CHART` of the chart
     knots : when it was there, of `Drift`
     centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
+    time : of the later line there [s]
     """
 
     line: int
     earlier: int
     knots: tuple[int, int]
     centre: Array
+    time: float
 
 
 @dataclass(frozen=True)
@@ -354,6 +356,16 @@ class Crossovers:
     refused: str = ""
     chart: str = ""
     misfit: float = 0.0
+
+    def as_dict(self) -> dict[str, object]:
+        """For summary.json."""
+        knots = {tie.knots for tie in self.ties}
+        return {
+            "relief_sd_m": self.relief.sd,
+            "relief_length_m": self.relief.length,
+            "time_s": [c.time for c in self.crossings],
+            "matched": [c.knots in knots for c in self.crossings],
+        }
 
     @property
     def text(self) -> str:
@@ -494,7 +506,7 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
             for own in np.array_split(np.arange(first, last), pieces):
                 a = own[least[own].argmin()] if pieces == 1 else own[len(own) // 2]
                 b = int(apart[a].argmin())
-                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b]))
+                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b], float(t[a])))
     return out
 
 
@@ -503,7 +515,7 @@ def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
     t, p, _ = lines[k].centre
     count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
     middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
-    return [Crossing(k, CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a]) for a in middle]
+    return [Crossing(k, CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
 
 
 class Field:
