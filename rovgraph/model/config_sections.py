@@ -589,9 +589,12 @@ class Graph(ConfigSection):
 
 
 class ChartSettings(ConfigSection):
-    """A chart of the bottom, with which soundings of `graph.crossovers` are compared too."""
+    """A chart of the bottom."""
 
-    file: str | None = Field(None, description="GeoTIFF of depths or heights in metres, its first band")
+    file: str | None = Field(
+        None,
+        description="GeoTIFF of depths or heights in metres; soundings are compared with it, as with earlier lines",
+    )
     sd_m: Positive = Field(0.5, description="error of a cell's depth, beside an offset of all")
     position_sd_m: NotNegative = Field(1.0, description="how far the chart as a whole may be off, north and east")
 
