@@ -32,7 +32,7 @@ SCALE_SD = 0.003
 FIXES_END, SPEED_FROM = 800.0, 820.0  # of the row with fixes: until when it has them, from when speed is compared [s]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Setting:
     """A dive with a DVL whose beams are in the log.
 
@@ -268,12 +268,12 @@ ROWS = {
     ),
     "wide beams, one 0.14 deg off, slope, fixes": Row(
         "speed within 0.2 % after calibration",
-        {"wide": Setting(1200.0, True, WIDE, True, 0.0, CALIBRATED)},
+        {"wide": Setting(seconds=1200.0, brisk=True, beams=WIDE, fixes=True, config=CALIBRATED)},
         speed_bias,
     ),
     "sound speed 30 m/s off, temperature and salinity in the log": Row(
         "dvl_scale within 0.3 %, its sd at most 0.3 %",
-        {"set": Setting(360.0, False, Beams(), False, SET / WATER - 1.0, (6.03, SET), SOUND)},
+        {"set": Setting(scale=SET / WATER - 1.0, water=(6.03, SET), config=SOUND)},
         scale_found,
     ),
 }

@@ -55,7 +55,8 @@ def simulated(path: Path) -> Path:
     rng = np.random.default_rng(4)
     velocity = np.einsum("nki,ni->nk", d_n, track.velocity) + rng.normal(0.0, 0.01, ranges.shape)
     below = cosine * ranges * (1.0 + rng.normal(0.0, 0.01, ranges.shape))
-    pings = zip(BEGAN + track.time, track.rpy, track.position[:, 2], velocity, below, strict=True)
+    depth = track.position[:, 2] + rng.normal(0.0, 0.05, len(track.time))
+    pings = zip(BEGAN + track.time, track.rpy, depth, velocity, below, strict=True)
     path.write_bytes(b"".join(ensemble(*ping) for ping in pings))
     return path
 

@@ -208,7 +208,8 @@ def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
     if sensor == "dvl":
         entry = f"{{estimate: true, mean: {lag:.3f}, sd: {max(0.02, 3.0 * sd):.2f}}}"
         return f"correct its clock, or state calibration.dvl_time_offset: {entry}"
-    delay = f"state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + lag:.2g}}}"
+    late = round(config.delay_s.get(sensor, 0.0) + lag, 4) + 0.0
+    delay = f"state delay_s: {{{sensor}: {late:.2g}}}"
     if sensor == "usbl":
         entry = f"{{estimate: true, mean: {lag:.2g}, sd: {max(0.1, 3.0 * sd):.2g}}}"
         return f"{delay}, or calibration.usbl_time_offset: {entry}"

@@ -17,7 +17,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
 from rovgraph.model.config import Config, parse_config
-from rovgraph.problem.beams import beam_sensors, head_against_velocity
+from rovgraph.problem.beams import PingsByBeams, beam_sensors, head_against_velocity
 from rovgraph.sensors.dvl_beam import (
     BEAMS,
     Refusals,
@@ -27,6 +27,7 @@ from rovgraph.sensors.dvl_beam import (
     taken_by_beams,
     velocity_by_beams,
 )
+from rovgraph.sensors.instruments import instruments
 
 # of velocity by four beams at 22.5 deg with 5.4 mm/s [m/s]
 SD = (0.0054 / np.sqrt([2.0 * np.sin(np.deg2rad(22.5)) ** 2] * 2 + [4.0 * np.cos(np.deg2rad(22.5)) ** 2])).tolist()
@@ -312,7 +313,8 @@ def test_of_orders_that_nearly_fit_a_level_straight_dive_the_right_one_is_named(
 def test_beams_by_another_clock_or_of_another_head_are_named(case):
     log, config = dive(case)
     later = replace(log[BEAMS], time=log[BEAMS].time + 0.1)
-    assert "stamps" in beam_sensors(config, {**log.streams, BEAMS: later})[1]
+    why = beam_sensors(config, {**log.streams, BEAMS: later})[1]
+    assert "stamps" in why and "state delay_s: {dvl_beams: 0.1}" in why
     shifted = replace(log[BEAMS], data=np.roll(log[BEAMS].data, 5, axis=1))
     why = beam_sensors(config, {**log.streams, BEAMS: shifted})[1]
     assert "of beams 4" in why and "state dvl.beams.first_number: 1" in why
@@ -352,3 +354,17 @@ def test_ranges_in_a_wrong_unit_or_straight_down_for_slant_are_named(case, quant
     streams = {**log.streams, BEAMS: replace(pings, data=cells.reshape(len(pings), -1)), "dvl_altitude": altitude}
     found = [f.text for f in ranges(replace(log, streams=streams), config)]
     assert len(found) == bool(said) and all(said in text for text in found)
+
+
+def test_velocities_are_left_out_where_their_pings_come_as_beams_by_another_clock(case):
+    log, config = dive(case, use="beams")
+    later = replace(log, streams={**log.streams, BEAMS: replace(log[BEAMS], time=log[BEAMS].time + 0.1)})
+    made, by_beams = PingsByBeams(config, instruments(config)).of_log(later.streams)
+    assert by_beams.all() and [len(stream) for stream in made] == [len(log[BEAMS])] * 4
+
+
+def test_axes_and_clock_that_make_beams_agree_with_the_imu_are_named(case):
+    log, config = dive(case, use="beams")
+    turned = changed(config, dvl={"mount_rpy_deg": [0.0, 0.0, 90.0]})
+    (found,) = [s for s in smooth(log, turned, "smoothed").statistics if s.kind == "axes"]
+    assert found.sensor == "dvl" and "state dvl.mount_rpy_deg" in found.remedy

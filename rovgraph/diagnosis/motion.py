@@ -29,11 +29,11 @@ from rovgraph.inference.gauss_newton import FaultyInterval
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import motion_row
-from rovgraph.model.calibration import TABLE
-from rovgraph.model.config import mount_matrix
-from rovgraph.problem.measurements import Measurements
+from rovgraph.model.calibration import BEAM_SENSORS, TABLE
+from rovgraph.model.config import Config, mount_matrix
+from rovgraph.problem.beams import solved_pings
 from rovgraph.rules import CHANCE, CLIPPED, CONTRADICTED, RULES, SETTLED_S, remedy_of_lag
-from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
+from rovgraph.sensors.dvl import axes_remedy
 
 IMU_S = 20.0  # over which errors of the IMU last, unlike noise
 # of a motion's residual: what people call it, columns, and the signal behind it
@@ -300,10 +300,7 @@ UNTIL_THEN = "until that is mended the track is wrong"
 def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
     best, config = evidence.optimum, evidence.initial.config
-    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < CONTRADICTED:
-        return
-    compared = _Compared.of(best, best.blocks["dvl"])
-    if compared is None:
+    if best is None or (compared := _Compared.of(best, config)) is None:
         return
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
     as_configured = compared.error(np.eye(3), R_bs, 0.0)
@@ -345,16 +342,23 @@ class _Compared:
         self.before, self.now = pairs
 
     @staticmethod
-    def of(best: Optimum, block: Measurements) -> "_Compared | None":
+    def of(best: Optimum, config: Config) -> "_Compared | None":
+        """None = few pings were rejected, or there is nothing to compare them with."""
         problem, state = best.problem, best.state
-        model = block.instrument.model
-        if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(problem) < 3:
+        heads = [sensor for sensor in ("dvl", *BEAM_SENSORS) if sensor in best.blocks]
+        if not heads or np.mean(np.concatenate([best.weights[s] for s in heads]) <= 0.0) < CONTRADICTED:
+            return None
+        block, solved = best.blocks[heads[0]], solved_pings(problem)
+        z, arm_b = block.z, np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
+        if len(solved.row):  # most pings are taken by their beams
+            block, z = replace(block, index=solved.row), solved.velocity
+        if len(block) < ENOUGH or len(problem) < 3:
             return None
         dv, seconds = problem.motions[:, motion_row.VELOCITY], problem.motions[:, motion_row.DURATION]
         gravity = np.array([0.0, 0.0, block.gravity])
         force_n = rotate(state.R_nb[:-1], dv - state.bias[:-1, :3] * seconds[:, None])
         velocity_n = np.vstack([np.zeros(3), np.cumsum(force_n + gravity * seconds[:, None], axis=0)])
-        broken = np.cumsum(problem.bridged)
+        broken = np.cumsum(problem.bridged | problem.coasted)
         k = block.keyframe.astype(np.int64)
         now = np.arange(len(block))
         before = np.searchsorted(block.time, block.time - OVER_S)
@@ -365,9 +369,9 @@ class _Compared:
             return None
         R_bn = transpose(state.R_nb[k[now]])
         rate_b = block.rate_b - state.bias[k, 3:]
-        swing_b = cross(rate_b, np.broadcast_to(model.lever_arm_b, rate_b.shape))
+        swing_b = cross(rate_b, np.broadcast_to(arm_b, rate_b.shape))
         change_b = rotate(R_bn, velocity_n[k[now]] - velocity_n[k[before]])
-        return _Compared(block.time, _averaged(block.z), swing_b, (before, now), R_bn @ state.R_nb[k[before]], change_b)
+        return _Compared(block.time, _averaged(z), swing_b, (before, now), R_bn @ state.R_nb[k[before]], change_b)
 
     def error(self, H: Array, R_bs: Array, shift: float) -> float:
         """Mean square of the differences, for axes H and stamps that are late by ``shift`` [m^2/s^2]."""

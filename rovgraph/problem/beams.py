@@ -21,6 +21,7 @@ from rovgraph.model.config import Config
 from rovgraph.model.config_sections import Dvl
 from rovgraph.problem.admission import admitted
 from rovgraph.problem.problem import Problem
+from rovgraph.rules import remedy_of_lag
 from rovgraph.sensors.dvl_beam import (
     BEAMS,
     BeamGeometry,
@@ -38,6 +39,7 @@ MOVING, SDS = 0.1, 5.0  # speed at which beams and velocity are compared [m/s], 
 AGREES, ENOUGH = 0.06, 20  # part of the speed, and pings
 SAME_STAMPS = 0.5  # share of pings whose beams and velocity have one stamp
 MOST_ORDERED = 5  # beams whose orders are tried
+LAGS_S = np.arange(-3.0, 3.005, 0.01)  # that are tried
 ONE_PING_S = 0.01  # stamps of beams and velocity of one ping differ by less
 BY_BEAMS = "taken by its beams"
 
@@ -92,9 +94,28 @@ def head_against_velocity(config: Config, streams: Mapping[str, Stream]) -> Wron
     same = np.abs(dvl.time[near] - pings.time) < ONE_PING_S
     if same.mean() < SAME_STAMPS and len(same) >= ENOUGH:
         text = f"{same.mean():.0%} of the beams' stamps are those of a velocity"
-        return WrongHead("contradiction", text, "state delay_s.dvl_beams, or convert the native files again")
+        late = _late(geometry, pings, dvl)
+        remedy = "state delay_s.dvl_beams" if late is None else remedy_of_lag(config, BEAMS, late, 0.0)
+        return WrongHead("clock", text, f"{remedy}, or convert the native files again")
     beams = beams_of(pings.data, geometry.numbers)
     return _of_velocities(config.dvl, geometry, beams, dvl.data[near], same)
+
+
+def _late(geometry: BeamGeometry, pings: Stream, dvl: Stream) -> float | None:
+    """How much later than the velocities' the stamps of beams are [s]; None = no lag stands out."""
+    beams, good = beams_of(pings.data, geometry.numbers), dvl.data[:, 3] == 1.0
+    whole = beams.valid.all(axis=1)
+    if min(np.count_nonzero(whole), np.count_nonzero(good)) < ENOUGH:
+        return None
+    v = beams.velocity[whole] @ np.linalg.pinv(geometry.directions).T
+    time, of_dvl, known = pings.time[whole], dvl.data[good, :3], dvl.time[good]
+
+    def off(lag: float) -> float:
+        at = np.column_stack([np.interp(time - lag, known, column) for column in of_dvl.T])
+        return float(np.median(np.linalg.norm(v - at, axis=1)))
+
+    least, lag = min((off(lag), float(lag)) for lag in LAGS_S)
+    return lag if least < 0.5 * off(0.0) else None
 
 
 def _of_velocities(
@@ -216,6 +237,8 @@ class PingsByBeams:
             good = admitted("dvl", dvl.data, self.config, Counter())
             near = nearest(dvl.time, beams.time)
             same = np.abs(dvl.time[near] - beams.time) < ONE_PING_S
+            if self.config.dvl.use == "beams" and same.mean() < SAME_STAMPS:  # the same pings, by another clock
+                return self.of(beams, accepted), ~by_beams
             accepted = np.where(same & good[near], 1.0, 0.0)
         made = self.of(beams, accepted)
         taken = np.isin(beams.time, np.concatenate([stream.time for stream in made]))
