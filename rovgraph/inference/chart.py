@@ -3,10 +3,11 @@
 Depths of a chart count from its own datum, soundings from the surface: what lies between is not known and not needed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,6 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.model.config_sections import ChartSettings
 from rovgraph.model.origin import Origin, lat_lon
-
-if TYPE_CHECKING:
-    from rovgraph.inference.crossovers import Line, Relief
 
 MOST_CELLS = 100_000_000  # of a file
 MOST_AROUND = 4_000_000  # about a track; where there are more, they are taken wider
@@ -93,16 +91,20 @@ class Chart:
         cells = np.moveaxis((place - self.corner) / self.step, -1, 0)
         return np.asarray(map_coordinates(self.depth, cells, order=1, cval=np.nan))
 
-    def smoothed(self, relief: "Relief") -> "SmoothedChart":
+    def smoothed(self, covariance: Callable[[Array], Array], length: float) -> "SmoothedChart":
         """The bottom as the chart shows it, by kriging: relief is normal about what varies slowly.
 
         The errors are those far from holes; what is near one is left out.
+
+        Parameters
+        ----------
+        covariance, length : of the relief at distances, and its correlation length [m]
         """
         from scipy.ndimage import gaussian_filter
 
         shape = tuple(2 * n for n in self.depth.shape)
         away = np.hypot(*np.meshgrid(*(self.step * n * np.abs(np.fft.fftfreq(n)) for n in shape), indexing="ij"))
-        S = np.fft.rfft2(relief.covariance(away)).real.clip(min=0.0)
+        S = np.fft.rfft2(covariance(away)).real.clip(min=0.0)
         known = np.isfinite(self.depth)
         wide = SLOWLY_M / self.step
         share = gaussian_filter(known.astype(float), wide, mode="nearest")
@@ -112,17 +114,16 @@ class Chart:
         mirrored = np.concatenate([mirrored, mirrored[:, ::-1]], axis=1)
         shown = np.fft.irfft2(np.fft.rfft2(mirrored) * S / (S + self.sd**2), shape)[: len(rest), : rest.shape[1]]
         error = np.fft.irfft2(S * self.sd**2 / (S + self.sd**2), shape)[0, : rest.shape[1]]
-        far = gaussian_filter(known.astype(float), relief.length / self.step, mode="nearest") > FAR
+        far = gaussian_filter(known.astype(float), length / self.step, mode="nearest") > FAR
         return SmoothedChart(np.where(known & far, slow + shown, np.nan), self.corner, self.step, self.sd, error)
 
-    def refused(self, lines: "list[Line]") -> str:
-        """Why soundings along a track cannot be of this chart, or ""."""
-        place = np.concatenate([line.place for line in lines])
-        own, charted = np.concatenate([line.depth for line in lines]), self.at(place)
-        known = np.isfinite(charted)
+    def refused(self, place: Array, depth: Array) -> str:
+        """Why soundings, n places and depths, cannot be of this chart, or ""."""
+        own = self.at(place)
+        known = np.isfinite(own)
         if not known.any():
             return "it has no depths where the track is"
-        sounded, charted = float(np.median(own[known])), float(np.median(charted[known]))
+        sounded, charted = float(np.median(depth[known])), float(np.median(own[known]))
         if abs(charted * FOOT - sounded) < min(0.1 * sounded, abs(charted - sounded)):
             return f"it has {charted:.0f} where soundings have {sounded:.1f} m: its depths look like feet"
         if abs(charted - sounded) > OFF_M:

@@ -29,16 +29,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
-from scipy.optimize import minimize
-from scipy.spatial import cKDTree
 
 from rovgraph.geometry import Array
+from rovgraph.inference.chart import Chart, ChartFile, SmoothedChart
 from rovgraph.model.origin import Origin
 
 if TYPE_CHECKING:
     from rovgraph.inference.bottom import Bottom
-    from rovgraph.inference.chart import Chart, ChartFile, SmoothedChart
     from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
@@ -219,6 +216,8 @@ def fit_relief(lines: Sequence[Line]) -> Relief:
 
     start = max((np.log(pair) for pair in product(LENGTHS_M, NOISES)), key=lambda log: relief(log).gain)
     bounds = np.log([(LENGTHS_M[0], LENGTHS_M[-1]), (NOISES[0], NOISES[-1])])
+    from scipy.optimize import minimize
+
     best = relief(minimize(lambda log: -relief(log).gain, start, method="Nelder-Mead", bounds=bounds).x)
     return replace(best, noise=max(best.noise, float(np.median([line.noise for line in lines]))))
 
@@ -383,7 +382,7 @@ class Crossovers:
 
 
 def with_crossovers(
-    estimate: "Estimate", bottom: "Bottom", chart: "ChartFile | None" = None, origin: Origin = (0.0, 0.0)
+    estimate: "Estimate", bottom: "Bottom", chart: ChartFile | None = None, origin: Origin = (0.0, 0.0)
 ) -> "tuple[Estimate, Crossovers]":
     """A smoothed track corrected where its soundings show its drift, and what they showed.
 
@@ -431,7 +430,7 @@ def with_crossovers(
     return replace(estimate, trajectory=corrected, posterior=None), found
 
 
-def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> Crossovers:
+def match(lines: Sequence[Line], drift: Drift, chart: Chart | None = None) -> Crossovers:
     """Match all crossings of a survey's lines together.
 
     Parameters
@@ -441,8 +440,10 @@ def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> 
     chart : of the same bottom
     """
     relief, track = fit_relief(lines), drift
-    off = "" if chart is None else chart.refused(lines)
-    known = None if chart is None or off else chart.smoothed(relief)
+    off = ""
+    if chart is not None and lines:
+        off = chart.refused(np.concatenate([x.place for x in lines]), np.concatenate([x.depth for x in lines]))
+    known = None if chart is None or off else chart.smoothed(relief.covariance, relief.length)
     pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if known is not None else []
     for _ in range(ROUNDS):
         crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
@@ -459,7 +460,7 @@ def match(lines: Sequence[Line], drift: Drift, chart: "Chart | None" = None) -> 
 
 
 def _match(
-    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: "SmoothedChart | None"
+    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: SmoothedChart | None
 ) -> Crossovers:
     if len(crossings) < ENOUGH:
         return Crossovers(relief, crossings, refused=f"lines cross or run again fewer than {ENOUGH} times")
@@ -566,7 +567,7 @@ def _of_plane(p: Array) -> Array:
 class ChartField:
     """As `Field`, of a piece of a line on a chart; soundings in its holes do not count."""
 
-    def __init__(self, x: Array, z: Array, chart: "SmoothedChart", relief: Relief) -> None:
+    def __init__(self, x: Array, z: Array, chart: SmoothedChart, relief: Relief) -> None:
         self._x, self._z, self._chart = x, z, chart
         own = relief.noise**2 * np.eye(len(x)) + _of_plane(x)
         r, away = np.linalg.norm(x[:, None] - x, axis=-1), x - x.mean(axis=0)
@@ -600,7 +601,7 @@ def _soundings_at(
     predicted: Array,
     reach: float,
     relief: Relief,
-    chart: "SmoothedChart | None",
+    chart: SmoothedChart | None,
 ) -> Field | ChartField:
     """The field of soundings in reach of a crossing."""
     if crossing.earlier == CHART and chart is not None:
@@ -652,6 +653,9 @@ class Match:
         values, misfit : ndarray, shape (n, n), the field there
         """
         V = self.shifts.of(k)[1]
+        from scipy.ndimage import maximum_filter
+        from scipy.spatial import cKDTree
+
         step = cells[1, 0, 0] - cells[0, 0, 0]
         density = np.where(np.isfinite(values), _robust(values), -np.inf) - 0.5 * self.far(k, cells) ** 2
         density += np.log(step**2 / (2.0 * np.pi)) - 0.5 * np.linalg.slogdet(V)[1]
@@ -695,7 +699,7 @@ class Peak:
 
 
 def associate(
-    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: "SmoothedChart | None"
+    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: SmoothedChart | None
 ) -> tuple[list[Match], float]:
     """The best combinations of peaks, best first, and how far was looked for [m].
 
