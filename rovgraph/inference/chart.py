@@ -43,7 +43,7 @@ class ChartFile:
     def around(self, low: Array, high: Array, origin: Origin) -> "Chart":
         """The part between two places, shape (2,) each, north and east [m]."""
         from rasterio.warp import transform
-        from scipy.ndimage import map_coordinates
+        from scipy.ndimage import map_coordinates  # type: ignore[attr-defined]
 
         def cells_of(north: Array, east: Array) -> Array:
             lat, lon = lat_lon(north.ravel(), east.ravel(), origin)
@@ -86,7 +86,7 @@ class Chart:
 
     def at(self, place: Array) -> Array:
         """Depths at places, shape (..., 2); NaN in holes and beyond."""
-        from scipy.ndimage import map_coordinates
+        from scipy.ndimage import map_coordinates  # type: ignore[attr-defined]
 
         cells = np.moveaxis((place - self.corner) / self.step, -1, 0)
         return np.asarray(map_coordinates(self.depth, cells, order=1, cval=np.nan))
@@ -100,7 +100,7 @@ class Chart:
         ----------
         covariance, length : of the relief at distances, and its correlation length [m]
         """
-        from scipy.ndimage import gaussian_filter
+        from scipy.ndimage import gaussian_filter  # type: ignore[attr-defined]
 
         shape = tuple(2 * n for n in self.depth.shape)
         away = np.hypot(*np.meshgrid(*(self.step * n * np.abs(np.fft.fftfreq(n)) for n in shape), indexing="ij"))

@@ -577,13 +577,14 @@ class ChartField:
         """The field and squared residuals by their number at g shifts, shape (g,) each."""
         off = self._z - self._chart.at(self._x + shifts[:, None])
         seen = np.isfinite(off)
-        out, misfit, every = np.zeros(len(shifts)), np.ones(len(shifts)), seen.all(axis=1)
-        some = np.flatnonzero(~every & (seen.mean(axis=1) > SEEN))
-        for part in (np.flatnonzero(every), *np.array_split(some, len(some) // 512 + 1)):
-            use = seen[part] if len(part) and not every[part[0]] else seen[part[:1]]  # with all, of all shifts the same
-            with_chart, chi2 = _log_normal(self._known, np.where(seen[part], off[part], 0.0), use)
+        share = seen.mean(axis=1)
+        whole, some = np.flatnonzero(share == 1.0), np.flatnonzero((share > SEEN) & (share < 1.0))
+        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
+        for rows in (whole, *np.array_split(some, len(some) // 512 + 1)):
+            use = seen[rows[:1]] if rows is whole else seen[rows]
+            with_chart, chi2 = _log_normal(self._known, np.where(seen[rows], off[rows], 0.0), use)
             alone, _ = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
-            out[part], misfit[part] = with_chart - alone, chi2 / seen[part].sum(axis=1)
+            out[rows], misfit[rows] = with_chart - alone, chi2 / seen[rows].sum(axis=1)
         return out, misfit
 
 
@@ -653,8 +654,8 @@ class Match:
         values, misfit : ndarray, shape (n, n), the field there
         """
         V = self.shifts.of(k)[1]
-        from scipy.ndimage import maximum_filter
-        from scipy.spatial import cKDTree
+        from scipy.ndimage import maximum_filter  # type: ignore[attr-defined]
+        from scipy.spatial import KDTree
 
         step = cells[1, 0, 0] - cells[0, 0, 0]
         density = np.where(np.isfinite(values), _robust(values), -np.inf) - 0.5 * self.far(k, cells) ** 2
@@ -664,7 +665,7 @@ class Match:
         tops = tops[np.argsort(-density[tuple(tops.T)])[:KEPT]]
         near = density.ravel() > density.max() - 3.0 * LEAD
         flat, weight = cells.reshape(-1, 2)[near], np.exp(density.ravel()[near] - density.max())
-        own = cKDTree(cells[tuple(tops.T)]).query(flat)[1]
+        own = KDTree(cells[tuple(tops.T)]).query(flat)[1]
 
         def mean(x: Array) -> Array:
             return np.asarray(np.bincount(own, weight * x, len(tops)) / mass)
@@ -726,7 +727,7 @@ def associate(
         inside = np.array([m.far(k, step * own) for m, own in zip(matches, cells, strict=True)]) < SIGMAS
         known, which = np.unique(cells[inside], axis=0, return_inverse=True)
         field = np.full((2, *inside.shape), -np.inf)
-        field[:, inside] = np.array(own.at(known * step))[:, which.reshape(-1)]
+        field[:, inside] = np.array(own.at(np.asarray(known * step, float)))[:, which.reshape(-1)]
         found = [
             (score, peak, match)
             for match, places, values, misfit in zip(matches, cells * step, *field, strict=True)
@@ -751,7 +752,7 @@ def _repetition(lines: Sequence[Line], far: float) -> float:
     most = 0.0
     for some in range(4):
         product, square, pairs = np.zeros((3, len(lags)))
-        for line in (lines[k] for k in np.flatnonzero(direction == some)):
+        for line in (lines[k] for k in np.flatnonzero(direction == some).tolist()):
             for side in np.unique(line.across):
                 own = line.across == side
                 z = np.full(np.ptp(line.along[own]) + 1, np.nan)
