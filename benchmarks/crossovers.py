@@ -315,7 +315,7 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
 def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool) -> Dive:
     """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %."""
     rng = np.random.default_rng([44, seed])
-    motion = survey_motion(6, 150.0, 15.0, 3) if small else survey_motion(12, 500.0, 25.0, 4)
+    motion = survey_motion(*(SMALL if small else Case().size))
     vehicle = make_vehicle("mti", ("ahrs", "depth"))
     beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
     vehicle.dvl = replace(
@@ -324,7 +324,8 @@ def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bo
     vehicle.dvl.rate, vehicle.imu.rate = 2.0, 50.0
     vehicle.ahrs = Compass(offset_sd=0.5, curve_sd=0.5)
     config = merge(configuration(vehicle), stated(beams.head))
-    config = merge(config, {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.003}}})
+    more = {"dvl_scale": {"estimate": True, "sd": 0.003}}
+    config = merge(config, {"calibration": more, "environment": {"earth_rotation": True}})  # as long legs need it
     streams, hidden = sample(motion, vehicle, rng, beams)
     return Dive(streams, config, motion, hidden)
 
@@ -351,7 +352,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
-    parser.add_argument("--small", action="store_true", help="dives of 6 lines of 150 m")
+    parser.add_argument("--small", action="store_true", help="dives of 8 lines of 250 m, with three crosslines")
     given = parser.parse_args()
     if given.dives:
         print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small)

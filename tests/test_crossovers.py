@@ -1,6 +1,7 @@
 """Crossovers: lines are matched by their soundings as a whole, or not at all."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rovgraph.errors import InputError
 from rovgraph.inference.chart import Chart, read_chart
 from rovgraph.inference.crossovers import Drift, Line, Tie, fit_relief, lines_of, match
 from rovgraph.model.config_sections import ChartSettings
+from rovgraph.report.pages.track import _crossings
 
 ORIGIN = 58.3, 11.4
 
@@ -221,3 +223,20 @@ def test_a_chart_that_cannot_be_used_is_refused_in_a_line(tmp_path):
     with pytest.raises(InputError, match="expected depths"):
         read_chart(settings, ORIGIN)
     assert read_chart(ChartSettings(), None) is None
+
+
+def test_the_map_of_a_page_shows_crossings():
+    class Main(dict):
+        kind = "smoothed"
+
+    t = np.arange(0.0, 100.0)
+    found = {"time_s": [10.0, 20.0, 30.0], "matched": [True, False, True]}
+    source = SimpleNamespace(
+        summary={"estimates": {"smoothed": {"crossovers": found}}},
+        main=Main(time=t, north=t, east=2.0 * t),
+        clock=lambda time: time,
+    )
+    traces = _crossings(source)
+    assert [trace["name"] for trace in traces] == ["crossings, matched (2)", "crossings, not matched (1)"]
+    source.summary = {}
+    assert _crossings(source) == []
