@@ -324,7 +324,7 @@ def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bo
     vehicle.dvl.rate, vehicle.imu.rate = 2.0, 50.0
     vehicle.ahrs = Compass(offset_sd=0.5, curve_sd=0.5)
     config = merge(configuration(vehicle), stated(beams.head))
-    more = {"dvl_scale": {"estimate": True, "sd": 0.003}}
+    more = {"dvl_scale": {"estimate": "considered", "sd": 0.003}}
     config = merge(config, {"calibration": more, "environment": {"earth_rotation": True}})  # as long legs need it
     streams, hidden = sample(motion, vehicle, rng, beams)
     return Dive(streams, config, motion, hidden)
