@@ -17,8 +17,9 @@ from rovgraph.geometry import Array
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.chart import ChartFile, read_chart
 from rovgraph.inference.correlated_noise import Rival
-from rovgraph.inference.crossovers import with_crossovers
+from rovgraph.inference.crossovers import Crossovers, with_crossovers
 from rovgraph.inference.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.initialise import initialise
@@ -112,7 +113,8 @@ def smooth(
     """
     log, frozen = without_frozen(log, config)
     log, gaps = without_attitude_gaps(log, config)
-    solver = _Solver(log, initialise(log, config), frozen, gaps, findings, estimate, progress)
+    chart = read_chart(config.chart, log.origin)
+    solver = _Solver(log, initialise(log, config), frozen, gaps, findings, estimate, progress, chart)
     solver.look_ahead()
     solver.solve()
     for search in (find_noise, find_errors) if config.graph.find_noise else ():
@@ -127,7 +129,7 @@ class _Solver:
 
     Attributes
     ----------
-    log, frozen, gaps, findings, estimate, progress : the dive, and what is asked for
+    log, frozen, gaps, findings, estimate, progress, chart : the dive, and what is asked for
     initial : how it begins, with what is believed
     found, rivals : what was revealed, and what would explain it as clearly
     beacons : where those may be whose places nobody stated
@@ -144,6 +146,7 @@ class _Solver:
     findings: Sequence[Finding]
     estimate: str
     progress: Progress
+    chart: ChartFile | None = None
     found: tuple[UnstatedNoise, ...] = ()
     rivals: tuple[Rival, ...] = ()
     beacons: list[BeaconPlaces] = field(default_factory=list)
@@ -254,22 +257,25 @@ class _Solver:
         if self.found:
             more["noise_found"] = [one.as_dict() for one in self.found]
         assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
-        if self.initial.config.graph.crossovers:
-            assumptions.insert(0, self._cross())
+        if self.initial.config.graph.crossovers or self.chart is not None:
+            text, found = self._cross()
+            assumptions.insert(0, text)
+            more |= {} if found is None else {"crossovers": found.as_dict()}
         return replace(self.dive(more), initial=replace(self.initial, assumptions=assumptions))
 
-    def _cross(self) -> str:
-        """Correct the smoothed estimate by its crossovers; one line on what was used."""
-        first = self.estimates[0]
+    def _cross(self) -> tuple[str, Crossovers | None]:
+        """Correct the smoothed estimate by its crossovers; one line on what was used, and what they showed."""
+        first, why = self.estimates[0], ""
         if first.kind != "smoothed" or first.posterior is None:
-            return "crossovers: nothing is used: they need a smoothed track of a dive without places or iSAM2"
-        if self.rivals or self.mirrors:
-            return "crossovers: nothing is used: another explanation of the dive is as likely"
-        bottom = bottom_of(self.log, self.initial.config, first)
-        if bottom is None:
-            return "crossovers: nothing is used: the log has no ranges to the bottom"
-        self.estimates[0], found = with_crossovers(first, bottom)
-        return found.text
+            why = "they need a smoothed track of a dive without places or iSAM2"
+        elif self.rivals or self.mirrors:
+            why = "another explanation of the dive is as likely"
+        elif (bottom := bottom_of(self.log, self.initial.config, first)) is None:
+            why = "the log has no ranges to the bottom"
+        else:
+            self.estimates[0], found = with_crossovers(first, bottom, self.chart, self.log.origin or (0.0, 0.0))
+            return found.text, found
+        return f"crossovers: nothing is used: {why}", None
 
     def dive(self, more: Mapping[str, object]) -> DiveEstimates:
         """As it is believed to be, with more in the summary of its main estimate."""

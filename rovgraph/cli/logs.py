@@ -111,6 +111,7 @@ _GROUP_TEXT = {
     "calibration": "calibration: estimated, considered, or exact",
     "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",
+    "chart": "chart: of the bottom",
     "online": "online: estimating as data arrive",
     "times": "times: what dates as text leave open",
 }

@@ -21,45 +21,52 @@ tie between two keyframes.
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.inference.chart import Chart, ChartFile, SmoothedChart
+from rovgraph.model.origin import Origin
 
 if TYPE_CHECKING:
     from rovgraph.inference.bottom import Bottom
     from rovgraph.inference.estimate import Estimate
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
+SCATTER = 4.0  # sd of a cell's soundings over what is usual, from which they are no bottom's: fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
 STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
-PIECE_M = 25.0  # of a line that is run again, matched by itself
+PIECE_M, CHART_PIECE_M = 25.0, 50.0  # of a line that is run again, or on a chart, matched by itself
+CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
-MOST = 60  # soundings of either line at a crossing
-LENGTHS_M = np.geomspace(1.0, 30.0, 12)  # of relief
-NOISES = np.geomspace(1e-3, 10.0, 17)  # variance of a sounding over that of the relief
+LEAST_CELLS, MOST = 4, 80  # soundings of either line at a crossing
+LENGTHS_M = np.geomspace(1.0, 30.0, 6)  # of relief
+NOISES = np.geomspace(1e-3, 10.0, 7)  # variance of a sounding over that of the relief
+AVERAGED = [(0.0, 2 / 3), (-CELL_M / 2**0.5, 1 / 6), (CELL_M / 2**0.5, 1 / 6)]  # of two cells: how far apart, weight
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
-PLANE, SLOPE = 10.0, 0.1  # sd of a line's plane about a crossing: height over that of the relief, slope
-GRID, FINEST_M, COARSEST_M = 0.2, 0.4, 1.2  # step of a field: of the relief's length, its limits
-SIGMAS, FARTHEST_M = 3.5, 20.0  # range of the search about what is predicted
+HEIGHT, TILT = 3.0, 0.02  # sd of a line's own height [m] and slope about a crossing: tide, depth sensor, trim
+SLOPE = 0.3  # of the bottom there, beside its relief
+GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
+SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 KEPT = 100  # combinations
-PEAK_SD = 0.3  # of a peak on the grid [m]
+SEEN = 0.5  # share of a piece's soundings that a chart must have
 FALSE = 0.05  # part of crossings whose soundings are not those of the bottom
 LEAD = 10.0  # nats
 ENOUGH = 3  # crossings
 SAME_M = 2.5  # shifts closer than that are the same
+ROUNDS = 3  # of the search, each with lines where the one before has them
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
+BETWEEN_M = 0.02  # sd of the drift between them
 SHOWS = 1.0  # nats, of a crossing that counts
-ALIKE = 0.6  # correlation of a profile with itself further on, from which the bottom repeats itself
+REPEATS, ENOUGH_PAIRS = 0.8, 100  # rise of the correlation of lines with themselves, and cells it needs: sand waves
 MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
-FINE_M = 0.25  # step of a field about its match
-LEAST = 1e-6  # information that a field may have [1/m^2]
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,7 @@ class Line:
     along, across : ndarray of int, shape (n,), of each cell
     place : ndarray, shape (n, 2), north and east [m]
     depth : ndarray, shape (n,) [m]
+    noise : sd of a depth by the scatter of its soundings [m]
     """
 
     time: Array
@@ -79,6 +87,7 @@ class Line:
     across: NDArray[np.int64]
     place: Array
     depth: Array
+    noise: float = 0.0
 
     @cached_property
     def centre(self) -> tuple[Array, Array, Array]:
@@ -132,9 +141,13 @@ def _cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
-    mean = mean[count >= 0.25 * np.median(count)] if len(count) else mean
+    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count)) / np.maximum(count - 1, 1)
+    usual = float(np.median(square[count > 1])) if (count > 1).any() else 0.0
+    good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
+    noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
+    mean = mean[good]
     along, across = np.round(mean[:, 1:3].T).astype(np.int64)
-    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5])
+    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise)
 
 
 @dataclass(frozen=True)
@@ -194,14 +207,19 @@ def fit_relief(lines: Sequence[Line]) -> Relief:
 
     unit = np.eye(STRETCH)
     none, _ = likelihood(np.broadcast_to(unit, r.shape))
-    best = Relief(0.0, 1.0, 1.0, -np.inf)
-    for length in LENGTHS_M:
-        k = _matern(r / length)
-        for noise in NOISES:
-            score, variance = likelihood(k + noise * unit)
-            if score - none > best.gain:
-                best = Relief(float(np.sqrt(variance)), length, float(np.sqrt(noise * variance)), score - none)
-    return best
+
+    def relief(log: Array) -> Relief:
+        length, noise = np.exp(log)
+        k = sum(w * _matern(np.abs(r + off) / length) for off, w in AVERAGED)
+        score, variance = likelihood(k + noise * unit)
+        return Relief(float(np.sqrt(variance)), float(length), float(np.sqrt(noise * variance)), score - none)
+
+    start = max((np.log(pair) for pair in product(LENGTHS_M, NOISES)), key=lambda log: relief(log).gain)
+    bounds = np.log([(LENGTHS_M[0], LENGTHS_M[-1]), (NOISES[0], NOISES[-1])])
+    from scipy.optimize import minimize
+
+    best = relief(minimize(lambda log: -relief(log).gain, start, method="Nelder-Mead", bounds=bounds).x)
+    return replace(best, noise=max(best.noise, float(np.median([line.noise for line in lines]))))
 
 
 def own_of(line: Line, cells: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -211,43 +229,37 @@ def own_of(line: Line, cells: NDArray[np.intp]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where a line crosses an earlier one, or runs over a piece of it again.
+    """Where a line crosses an earlier one, or runs over a piece of it again, or a piece of a line on a chart.
 
     Attributes
     ----------
-    line, earlier : numbers of the lines
+    line, earlier : numbers of the lines, `CHART` of the chart
     knots : when it was there, of `Drift`
-    centre : ndarray, shape (2,), north and east [m]
+    centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
+    time : of the later line there [s]
     """
 
     line: int
     earlier: int
     knots: tuple[int, int]
     centre: Array
+    time: float
 
 
 @dataclass(frozen=True)
 class Tie:
-    """What soundings say of the errors of a track at two knots: e(a) - e(b) = shift.
+    """What soundings say of the errors of a track at two knots, in information form.
 
     Attributes
     ----------
     knots : a, b
-    shift : ndarray, shape (2,), north and east [m]
-    information : ndarray, shape (2, 2) [1/m^2]
+    information : ndarray, shape (2, 2), of e(a) - e(b) [1/m^2]
+    pull : ndarray, shape (2,), information times shift [1/m]
     """
 
     knots: tuple[int, int]
-    shift: Array
     information: Array
-
-    def rows(self, count: int) -> tuple[Array, Array]:
-        """Whitened Jacobian by the errors of all knots, shape (2, 2 count), and right-hand side, shape (2,)."""
-        value, axes = np.linalg.eigh(self.information)
-        W = np.sqrt(np.maximum(value, 0.0))[:, None] * axes.T
-        J = np.zeros((2, count, 2))
-        J[:, self.knots[0]], J[:, self.knots[1]] = W, -W
-        return J.reshape(2, -1), W @ self.shift
+    pull: Array
 
 
 @dataclass(frozen=True)
@@ -265,6 +277,12 @@ class Drift:
     mean: Array
     P: Array
 
+    def beside(self, sd: float) -> "Drift":
+        """With one more knot, never reached: the error of a chart's place, north and east."""
+        P = np.pad(self.P, (0, 2))
+        P[-2:, -2:] = max(sd, 1e-3) ** 2 * np.eye(2)
+        return Drift(np.append(self.time, np.inf), np.append(self.mean, [0.0, 0.0]), P)
+
     def knot(self, time: float) -> int:
         """The one next to a time."""
         return int(np.abs(self.time - time).argmin())
@@ -273,20 +291,48 @@ class Drift:
         """The mean at some times, shape (n, 2) [m]."""
         return np.stack([np.interp(time, self.time, axis) for axis in self.mean.reshape(-1, 2).T], axis=-1)
 
-    def between(self, crossings: Sequence[Crossing]) -> tuple[Array, Array]:
-        """Mean and covariance of the shifts at k crossings, shapes (2 k,) and (2 k, 2 k)."""
+    def between(self, crossings: Sequence[Crossing]) -> "Shifts":
+        """Of the errors at k crossings."""
         a, b = ((np.array([c.knots[end] for c in crossings])[:, None] * 2 + [0, 1]).ravel() for end in (0, 1))
         moved = self.P[a] - self.P[b]
-        return self.mean[a] - self.mean[b], moved[:, a] - moved[:, b]
+        return Shifts(self.mean[a] - self.mean[b], moved[:, a] - moved[:, b] + BETWEEN_M**2 * np.eye(len(a)))
 
     def tied(self, ties: Sequence[Tie]) -> "Drift":
         """What is left when ties are known."""
-        rows = [tie.rows(len(self.time)) for tie in ties]
-        J, z = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-        PJ = self.P @ J.T
-        gain = np.linalg.solve(J @ PJ + np.eye(len(z)), PJ.T).T
-        P = self.P - gain @ PJ.T
-        return Drift(self.time, self.mean + gain @ (z - J @ self.mean), 0.5 * (P + P.T))
+        mean, P = self.mean, self.P
+        for tie in ties:
+            a, b = (slice(2 * knot, 2 * knot + 2) for knot in tie.knots)
+            column = P[:, a] - P[:, b]
+            gain = column @ np.linalg.inv(np.eye(2) + tie.information @ (column[a] - column[b]))
+            mean = mean + gain @ (tie.pull - tie.information @ (mean[a] - mean[b]))
+            P = P - gain @ tie.information @ column.T
+        return Drift(self.time, mean, 0.5 * (P + P.T))
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """Shifts at k crossings: a normal distribution.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (2 k,) [m]
+    P : ndarray, shape (2 k, 2 k) [m^2]
+    """
+
+    mean: Array
+    P: Array
+
+    def of(self, k: int) -> tuple[Array, Array]:
+        """Mean and covariance of one."""
+        own = slice(2 * k, 2 * k + 2)
+        return self.mean[own], self.P[own, own]
+
+    def given(self, k: int, information: Array, pull: Array) -> "Shifts":
+        """With what soundings say of one."""
+        m, V = self.of(k)
+        column = self.P[:, 2 * k : 2 * k + 2]
+        gain = column @ np.linalg.inv(np.eye(2) + information @ V)
+        return Shifts(self.mean + gain @ (pull - information @ m), self.P - gain @ information @ column.T)
 
 
 @dataclass(frozen=True)
@@ -296,39 +342,48 @@ class Crossovers:
     Attributes
     ----------
     relief : of the bottom
-    ties : of matched crossings
-    lines, matched : how many lines cross or run over three earlier pieces or more, and how many of them were matched
-    crossings : how many they have
-    refused : reason -> count of lines that were not
+    crossings : of its lines
+    ties : of those that were matched
+    refused : why nothing is used, or ""
+    chart : why the chart is not, or ""
+    misfit : squared residuals over what is expected, where they contradict a match
     """
 
     relief: Relief
-    ties: list[Tie] = field(default_factory=list)
-    lines: int = 0
-    matched: int = 0
-    crossings: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
+    crossings: Sequence[Crossing] = ()
+    ties: Sequence[Tie] = ()
+    refused: str = ""
+    chart: str = ""
+    misfit: float = 0.0
+
+    def as_dict(self) -> dict[str, object]:
+        """For summary.json."""
+        knots = {tie.knots for tie in self.ties}
+        return {
+            "relief_sd_m": self.relief.sd,
+            "relief_length_m": self.relief.length,
+            "time_s": [c.time for c in self.crossings],
+            "matched": [c.knots in knots for c in self.crossings],
+        }
 
     @property
     def text(self) -> str:
         """One line for people."""
-        if self.ties:
-            r = self.relief
-            return (
-                f"crossovers: {self.matched} of {self.lines} lines matched with earlier ones at {len(self.ties)} of "
-                f"{self.crossings} crossings, by relief of {r.sd:.2f} m over {r.length:.1f} m"
-            )
-        if self.lines and not self.relief.shows:
-            why = f"the bottom's relief of {self.relief.sd:.2f} m is not above the noise of its soundings"
-            why = why if self.relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
-        elif self.lines:
-            why = "; ".join(f"{count} of {self.lines} lines: {why}" for why, count in self.refused.items())
-        else:
-            why = f"no line crosses, or runs again over, {ENOUGH} pieces of earlier ones"
-        return f"crossovers: nothing is used: {why}"
+        chart = f"; the chart is not used: {self.chart}" if self.chart else ""
+        if self.refused:
+            return f"crossovers: nothing is used: {self.refused}{chart}"
+        r, knots = self.relief, {tie.knots for tie in self.ties}
+        charted, crossed = (
+            [c.knots in knots for c in self.crossings if (c.earlier == CHART) == on] for on in (True, False)
+        )
+        counts = [f"{sum(crossed)} of {len(crossed)} crossings of the survey's lines"] if crossed else []
+        counts += [f"{sum(charted)} of {len(charted)} pieces on the chart"] if charted else []
+        return f"crossovers: {' and '.join(counts)} matched, by relief of {r.sd:.2f} m over {r.length:.1f} m{chart}"
 
 
-def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, Crossovers]":
+def with_crossovers(
+    estimate: "Estimate", bottom: "Bottom", chart: ChartFile | None = None, origin: Origin = (0.0, 0.0)
+) -> "tuple[Estimate, Crossovers]":
     """A smoothed track corrected where its soundings show its drift, and what they showed.
 
     The correction and what it leaves of the covariance are exact at the knots of the drift, and interpolated between
@@ -338,6 +393,7 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     ----------
     estimate : smoothed, with its joint covariance
     bottom : under it
+    chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
     track, posterior = estimate.trajectory, estimate.posterior
     assert posterior is not None
@@ -348,10 +404,17 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     at, place, depth = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], at, place, depth)
     drift = Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
-    found = match(lines, drift)
+    around = None
+    if chart is not None:
+        drift = drift.beside(chart.settings.position_sd_m)
+        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
+        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
+    found = match(lines, drift, around)
     if not found.ties:
         return estimate, found
     left = drift.tied(found.ties)
+    if chart is not None:
+        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
     moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
     interval = np.clip(np.searchsorted(left.time, track.time, side="right") - 1, 0, len(rate) - 1)
     p_n, v_n, cov_p = track.p_n.copy(), track.v_n.copy(), track.cov_p.copy()
@@ -367,48 +430,59 @@ def with_crossovers(estimate: "Estimate", bottom: "Bottom") -> "tuple[Estimate, 
     return replace(estimate, trajectory=corrected, posterior=None), found
 
 
-def match(lines: Sequence[Line], drift: Drift) -> Crossovers:
-    """Match each line, as a whole, with all earlier ones.
+def match(lines: Sequence[Line], drift: Drift, chart: Chart | None = None) -> Crossovers:
+    """Match all crossings of a survey's lines together.
 
     Parameters
     ----------
     lines : in the order of time
-    drift : of the track
+    drift : of the track; with a chart, its last knot is that of the chart
+    chart : of the same bottom
     """
-    relief = fit_relief(lines)
-    out = Crossovers(relief)
-    todo = list(range(1, len(lines)))
-    counts: dict[int, int] = {}
-    reasons: dict[int, str] = {}
-    ties: list[Tie] = []
-    done: set[int] = set()
-    for _ in range(2):  # what an accepted line has tied may make an earlier one clear
-        before = len(done)
-        for k in todo:
-            if k in done:
-                continue
-            crossings = crossings_of(lines, k, drift)
-            if len(crossings) < ENOUGH:
-                continue
-            counts[k] = len(crossings)
-            if not relief.shows:
-                continue
-            found = _Search(lines, crossings, drift, relief).ties()
-            if isinstance(found, str):
-                reasons[k] = found
-                continue
-            reasons.pop(k, None)
-            done.add(k)
-            ties += found
-            drift = drift.tied(found)
-        if len(done) in (before, 0):
+    relief, track = fit_relief(lines), drift
+    off = ""
+    if chart is not None and lines:
+        off = chart.refused(np.concatenate([x.place for x in lines]), np.concatenate([x.depth for x in lines]))
+    known = None if chart is None or off else chart.smoothed(relief.covariance, relief.length)
+    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if known is not None else []
+    for _ in range(ROUNDS):
+        crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
+        found = replace(_match(lines, crossings, drift, relief, known), chart=off)
+        if found.misfit > MISFIT:
+            relief = replace(relief, noise=relief.noise * found.misfit)  # or relief that its model does not describe
+            continue
+        if not found.ties:
             break
-    refused: dict[str, int] = {}
-    for why in reasons.values():
-        refused[why] = refused.get(why, 0) + 1
-    return replace(
-        out, ties=ties, lines=len(counts), matched=len(done), crossings=sum(counts.values()), refused=refused
-    )
+        before, track = track, drift.tied(found.ties)
+        if np.abs(track.mean - before.mean).max() < BESIDE_M:
+            break
+    return found
+
+
+def _match(
+    lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief, chart: SmoothedChart | None
+) -> Crossovers:
+    if len(crossings) < ENOUGH:
+        return Crossovers(relief, crossings, refused=f"lines cross or run again fewer than {ENOUGH} times")
+    if not relief.shows:
+        why = f"the bottom's relief of {relief.sd:.2f} m is not above the noise of its soundings"
+        why = why if relief.gain > LEAD else "the bottom shows no relief above the noise of its soundings"
+        return Crossovers(relief, crossings, refused=why)
+    matches, reach = associate(lines, crossings, drift.between(crossings), relief, chart)
+    if _repetition(lines, 2.0 * reach) > REPEATS:
+        return Crossovers(relief, crossings, refused="the bottom repeats itself, as sand waves do")
+    best = matches[0]
+    if best.score < LEAD:
+        return Crossovers(relief, crossings, refused="soundings of its lines do not match")
+    likely = np.array([m.shifts.mean for m in matches if m.score > best.score - LEAD]).reshape(-1, len(crossings), 2)
+    spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
+    ties = [tie for k, tie in best.ties.items() if spread[k] < SAME_M]
+    if len(ties) < ENOUGH:
+        return Crossovers(relief, crossings, refused="another match is nearly as likely")
+    if best.misfit > MISFIT:
+        why = "its soundings contradict the match"
+        return Crossovers(relief, crossings, refused=why, misfit=best.misfit)
+    return Crossovers(relief, crossings, ties)
 
 
 def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
@@ -417,8 +491,8 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
     p = p + drift.at(t)
     out = []
     for j in range(k):
-        t_b, p_b, width_b = lines[j].centre
-        p_b = p_b + drift.at(t_b)
+        t_b, own_b, width_b = lines[j].centre
+        p_b = own_b + drift.at(t_b)
         reach = float(width + width_b) + CELL_M
         low, high = p_b.min(axis=0) - reach, p_b.max(axis=0) + reach
         near = ((p >= low) & (p <= high)).all(axis=1)
@@ -433,17 +507,28 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
             for own in np.array_split(np.arange(first, last), pieces):
                 a = own[least[own].argmin()] if pieces == 1 else own[len(own) // 2]
                 b = int(apart[a].argmin())
-                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), 0.5 * (p[a] + p_b[b])))
+                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b], float(t[a])))
     return out
 
 
-class _Field:
-    """Log likelihood of the shift at a crossing; heights and slopes of both lines there are their own."""
+def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
+    """Pieces of a line that are on a chart."""
+    t, p, _ = lines[k].centre
+    count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
+    middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
+    return [Crossing(k, CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
+
+
+class Field:
+    """Log likelihood of the shift at a crossing over that of no common relief.
+
+    Heights and slopes of both lines there differ by what tide and trim do; the bottom's own slope is common.
+    """
 
     def __init__(self, a: tuple[Array, Array], b: tuple[Array, Array], relief: Relief) -> None:
         (self._x, z), (self._y, w), self._relief = a, b, relief
         own = [
-            relief.covariance(_apart(p, p)) + relief.noise**2 * np.eye(len(p)) + _of_plane(p, relief.sd)
+            self._common(p, p, np.zeros((1, 2)))[0] + relief.noise**2 * np.eye(len(p)) + _of_plane(p)
             for p in (self._x, self._y)
         ]
         self._own, self._z = own[0], z - z.mean()
@@ -451,8 +536,13 @@ class _Field:
         self._known = self._root @ (w - w.mean())
         self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0][0]
 
+    def _common(self, x: Array, y: Array, shifts: Array) -> Array:
+        """Covariance of the bottom's depth at places x + shift and y, shape (g, n, m)."""
+        r = np.linalg.norm((x[:, None] - y) + shifts[:, None, None], axis=-1)
+        return self._relief.covariance(r) + SLOPE**2 * x @ y.T  # of what a slope does over the shift, see heights
+
     def _likelihood(self, common: Array) -> tuple[Array, Array]:
-        """Of g covariances of the relief at both lines, and squared residuals by their number."""
+        """Of g covariances of both lines, and squared residuals by their number."""
         V = common @ self._root.T
         L = np.linalg.cholesky(self._own - V @ np.swapaxes(V, 1, 2))
         white = np.linalg.solve(L, (self._z - V @ self._known)[..., None])[..., 0]
@@ -464,157 +554,189 @@ class _Field:
         out, misfit = np.empty(len(shifts)), np.empty(len(shifts))
         for first in range(0, len(shifts), 256):
             part = slice(first, first + 256)
-            moved = self._x[None] + shifts[part, None]
-            out[part], misfit[part] = self._likelihood(self._relief.covariance(_apart(moved, self._y)))
+            out[part], misfit[part] = self._likelihood(self._common(self._x, self._y, shifts[part]))
         return out - self._none, misfit
 
 
-def _of_plane(p: Array, sd: float) -> Array:
+def _of_plane(p: Array) -> Array:
+    """Covariance of what height and slope of a line do at some places."""
     away = p - p.mean(axis=0)
-    return np.asarray((PLANE * sd) ** 2 + SLOPE**2 * away @ away.T)
+    return np.asarray(HEIGHT**2 + TILT**2 * away @ away.T)
 
 
-def _apart(x: Array, y: Array) -> Array:
-    return np.asarray(np.sqrt(((x[..., :, None, :] - y[..., None, :, :]) ** 2).sum(axis=-1)))
+class ChartField:
+    """As `Field`, of a piece of a line on a chart; soundings in its holes do not count."""
+
+    def __init__(self, x: Array, z: Array, chart: SmoothedChart, relief: Relief) -> None:
+        self._x, self._z, self._chart = x, z, chart
+        own = relief.noise**2 * np.eye(len(x)) + _of_plane(x)
+        r, away = np.linalg.norm(x[:, None] - x, axis=-1), x - x.mean(axis=0)
+        self._known, self._alone = own + chart.covariance(r), own + relief.covariance(r) + SLOPE**2 * away @ away.T
+
+    def at(self, shifts: Array) -> tuple[Array, Array]:
+        """The field and squared residuals by their number at g shifts, shape (g,) each."""
+        off = self._z - self._chart.at(self._x + shifts[:, None])
+        seen = np.isfinite(off)
+        share = seen.mean(axis=1)
+        whole, some = np.flatnonzero(share == 1.0), np.flatnonzero((share > SEEN) & (share < 1.0))
+        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
+        for rows in (whole, *np.array_split(some, len(some) // 512 + 1)):
+            use = seen[rows[:1]] if rows is whole else seen[rows]
+            with_chart, chi2 = _log_normal(self._known, np.where(seen[rows], off[rows], 0.0), use)
+            alone, _ = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
+            out[rows], misfit[rows] = with_chart - alone, chi2 / seen[rows].sum(axis=1)
+        return out, misfit
 
 
-class _Search:
-    """A line against all earlier ones."""
+def _log_normal(covariance: Array, off: Array, use: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Log densities of residuals that are used, shape (g, n), without their constant, and squares of the white ones."""
+    L = np.linalg.cholesky(np.where(use[:, :, None] & use[:, None], covariance, np.eye(len(covariance))))
+    white = (np.linalg.inv(L) @ off[..., None])[..., 0] if len(L) == 1 else np.linalg.solve(L, off[..., None])[..., 0]
+    chi2 = (white**2).sum(axis=-1)
+    return -0.5 * chi2 - np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1), chi2
 
-    def __init__(self, lines: Sequence[Line], crossings: Sequence[Crossing], drift: Drift, relief: Relief) -> None:
-        self._lines, self._drift, self._relief = lines, drift, relief
-        mean, P = drift.between(crossings)
-        order = _clearest_first(P)
-        self._crossings = [crossings[k] for k in order]
-        own = (np.array(order)[:, None] * 2 + [0, 1]).ravel()
-        self._mean, self._P = mean[own], P[np.ix_(own, own)]
-        self._fields: list[_Field] = []
-        self._range = 0.0
-        self._step = float(np.clip(GRID * relief.length, FINEST_M, COARSEST_M))
 
-    def ties(self) -> list[Tie] | str:
-        """What all likely combinations have in common, or why nothing is used."""
-        shifts, score = self._combinations()
-        likely = shifts[score > score[0] - LEAD]
-        spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
-        clear = np.flatnonzero(spread < SAME_M)
-        if len(clear) < ENOUGH:
-            return "another match is nearly as likely"
-        if self._repeats():
-            return "the bottom repeats itself"
-        found, gain, shown, misfit = self._propagated(shifts[0], clear)
-        if gain < LEAD or (shown > SHOWS).sum() < ENOUGH:
-            return "its soundings do not match"
-        if misfit > MISFIT:
-            return "its soundings contradict the match"
-        return found
+def _soundings_at(
+    lines: Sequence[Line],
+    crossing: Crossing,
+    predicted: Array,
+    reach: float,
+    relief: Relief,
+    chart: SmoothedChart | None,
+) -> Field | ChartField:
+    """The field of soundings in reach of a crossing."""
+    if crossing.earlier == CHART and chart is not None:
+        line = lines[crossing.line]
+        own = np.linalg.norm(line.place - crossing.centre, axis=1) < CHART_PIECE_M / 2.0
+        return ChartField(line.place[own], line.depth[own], chart, relief)
+    sides = []
+    for line, moved in ((lines[crossing.line], predicted), (lines[crossing.earlier], np.zeros(2))):
+        off = np.linalg.norm(line.place + moved - crossing.centre, axis=1)
+        own = np.argsort(off)[: np.clip((off < reach).sum(), LEAST_CELLS, MOST)]
+        sides.append((line.place[own] - crossing.centre, line.depth[own]))
+    return Field(sides[0], sides[1], relief)
 
-    def _field(self, k: int, predicted: Array, reach: float) -> _Field:
-        """Of a crossing, from soundings in reach of where it is predicted."""
-        c, sides = self._crossings[k], []
-        centre = c.centre - self._drift.mean.reshape(-1, 2)[c.knots[1]]  # where the earlier line's soundings have it
-        for line, moved in ((self._lines[c.line], predicted), (self._lines[c.earlier], np.zeros(2))):
-            off = np.linalg.norm(line.place + moved - centre, axis=1)
-            own = np.flatnonzero(off < reach)
-            own = own[np.argsort(off[own])[:MOST]]
-            sides.append((line.place[own] - centre, line.depth[own]))
-        return _Field(sides[0], sides[1], self._relief)
 
-    def _combinations(self) -> tuple[Array, Array]:
-        """The best combinations of shifts, shape (h, k, 2), best first, and their log likelihoods, shape (h,)."""
-        shifts, score = np.zeros((1, 0, 2)), np.zeros(1)
-        noise = PEAK_SD**2
-        for k in range(len(self._crossings)):
-            own, seen = slice(2 * k, 2 * k + 2), slice(0, 2 * k)
-            gain = np.linalg.solve(self._P[seen, seen] + noise * np.eye(2 * k), self._P[seen, own]).T
-            C = self._P[own, own] - gain @ self._P[seen, own] + noise * np.eye(2)
-            predicted = self._mean[own] + (shifts.reshape(len(shifts), -1) - self._mean[seen]) @ gain.T
-            far = min(SIGMAS * np.sqrt(np.linalg.eigvalsh(C)[-1]), FARTHEST_M)
-            self._range = max(self._range, far)
-            reach = far + np.linalg.norm(predicted - predicted[0], axis=1).clip(max=FARTHEST_M).max()
-            axis = np.arange(-np.ceil(reach / self._step), np.ceil(reach / self._step) + 1) * self._step
-            grid = predicted[0] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-            flat = grid.reshape(-1, 2)
-            near = (np.linalg.norm(flat[:, None] - predicted, axis=2) < far + self._step).any(axis=1)
-            values = np.full(len(flat), -np.inf)
-            self._fields.append(self._field(k, predicted[0], min(reach, FARTHEST_M) + BESIDE_M))
-            values[near] = _robust(self._fields[-1].at(flat[near])[0])
-            away = flat - predicted[:, None]
-            white = np.linalg.solve(np.linalg.cholesky(C), np.swapaxes(away, 1, 2))
-            both = values - 0.5 * (white**2).sum(axis=1) - 0.5 * np.linalg.slogdet(C)[1]
-            peaks = _peaks(both.reshape(len(shifts), len(axis), len(axis))).reshape(len(shifts), -1)
-            total = np.where(peaks, score[:, None] + both, -np.inf).ravel()
-            best = np.argsort(-total)[:KEPT]
-            best = best[total[best] > total[best[0]] - 2.5 * LEAD]
-            before, cell = np.divmod(best, len(flat))
-            shifts = np.concatenate([shifts[before], flat[cell][:, None]], axis=1)
-            score = total[best]
-        return shifts, score
+@dataclass(frozen=True)
+class Match:
+    """A combination of peaks, one of each field so far.
 
-    def _repeats(self) -> bool:
-        """Whether the line, or all those that it crosses, look alike further on."""
-        earlier = [self._lines[k] for k in sorted({c.earlier for c in self._crossings})]
-        return any(
-            _most_alike(some, self._relief, 2.0 * self._range) > ALIKE
-            for some in ([self._lines[self._crossings[0].line]], earlier)
-        )
+    Attributes
+    ----------
+    shifts : of all crossings, with what the peaks say
+    score : log likelihood of the soundings with the match over that without
+    ties : number of a crossing -> what its peak says
+    misfits : squared residuals at the peaks, by their number
+    """
 
-    def _propagated(self, shifts: Array, clear: NDArray[np.intp]) -> tuple[list[Tie], float, Array, float]:
-        """Ties at some crossings, the log likelihood of the match, that of each crossing, and the residuals' excess."""
-        own = (clear[:, None] * 2 + [0, 1]).ravel()
-        mean, prior = self._mean[own], np.linalg.inv(self._P[np.ix_(own, own)] + 1e-4 * np.eye(len(own)))
-        axis = np.arange(-SAME_M, SAME_M + FINE_M / 2, FINE_M)
-        around = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-        grids = [shifts[k] + around for k in clear]
-        found = [self._fields[k].at(grid) for k, grid in zip(clear, grids, strict=True)]
-        values = [_robust(field) for field, _ in found]
-        count, sites = len(clear), [np.eye(2) / SAME_M**2] * len(clear)
-        pulls = [site @ shifts[k] for site, k in zip(sites, clear, strict=True)]
-        shown, misfit = np.zeros(count), np.zeros(count)
-        for _ in range(6):
-            for j in range(count):
-                part = slice(2 * j, 2 * j + 2)
-                others = prior.copy()
-                pull = prior @ mean
-                for i in range(count):
-                    if i != j:
-                        others[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += sites[i]
-                        pull[2 * i : 2 * i + 2] += pulls[i]
-                P = np.linalg.inv(others)
-                C, m = P[part, part], (P @ pull)[part]
-                away = grids[j] - m
-                inverse = np.linalg.inv(C)
-                density = values[j] - 0.5 * np.einsum("gi,ij,gj->g", away, inverse, away)
-                weight = np.exp(density - density.max())
-                weight /= weight.sum()
-                centre = weight @ grids[j]
-                spread = (grids[j] - centre).T @ ((grids[j] - centre) * weight[:, None]) + FINE_M**2 / 12.0 * np.eye(2)
-                value, axes = np.linalg.eigh(np.linalg.inv(spread) - inverse)
-                sites[j] = (axes * np.maximum(value, LEAST)) @ axes.T
-                pulls[j] = np.linalg.inv(spread) @ centre - inverse @ m if value[0] > LEAST else sites[j] @ centre
-                shown[j], misfit[j] = weight @ found[j][0], weight @ found[j][1]
-        ties = [
-            Tie(self._crossings[k].knots, np.linalg.solve(site, pull), site)
-            for k, site, pull in zip(clear, sites, pulls, strict=True)
+    shifts: Shifts
+    score: float = 0.0
+    ties: Mapping[int, Tie] = field(default_factory=dict)
+    misfits: tuple[float, ...] = ()
+
+    @property
+    def misfit(self) -> float:
+        """Mean of those of fields that show something."""
+        return float(np.nanmean(self.misfits))
+
+    def far(self, k: int, shifts: Array) -> Array:
+        """Distances of shifts of a crossing from what is predicted [sd]."""
+        m, V = self.shifts.of(k)
+        away = shifts - m
+        return np.asarray(np.sqrt((away @ np.linalg.inv(V) * away).sum(axis=-1)))
+
+    def peaks(self, k: int, cells: Array, values: Array, misfit: Array) -> "list[tuple[float, Peak]]":
+        """Where a field puts the shift of a crossing, with the score that each place would have.
+
+        Parameters
+        ----------
+        cells : ndarray, shape (n, n, 2), shifts [m]
+        values, misfit : ndarray, shape (n, n), the field there
+        """
+        V = self.shifts.of(k)[1]
+        from scipy.ndimage import maximum_filter  # type: ignore[attr-defined]
+        from scipy.spatial import KDTree
+
+        step = cells[1, 0, 0] - cells[0, 0, 0]
+        density = np.where(np.isfinite(values), _robust(values), -np.inf) - 0.5 * self.far(k, cells) ** 2
+        density += np.log(step**2 / (2.0 * np.pi)) - 0.5 * np.linalg.slogdet(V)[1]
+        size = 2 * int(SAME_M / step) + 1
+        tops = np.argwhere((density == maximum_filter(density, size)) & (density > density.max() - 2.0 * LEAD))
+        tops = tops[np.argsort(-density[tuple(tops.T)])[:KEPT]]
+        near = density.ravel() > density.max() - 3.0 * LEAD
+        flat, weight = cells.reshape(-1, 2)[near], np.exp(density.ravel()[near] - density.max())
+        own = KDTree(cells[tuple(tops.T)]).query(flat)[1]
+
+        def mean(x: Array) -> Array:
+            return np.asarray(np.bincount(own, weight * x, len(tops)) / mass)
+
+        mass = np.bincount(own, weight, len(tops))
+        place = np.stack([mean(x) for x in flat.T], axis=-1)
+        off = flat - place[own]
+        spread = np.array([[mean(a * b) for b in off.T] for a in off.T]).transpose(2, 0, 1) + step**2 / 12.0 * np.eye(2)
+        off = np.where(mean(values.ravel()[near]) > SHOWS, mean(misfit.ravel()[near]), np.nan)
+        score = self.score + np.log(mass) + density.max()
+        return [(float(score[j]), Peak(place[j], spread[j], float(off[j]))) for j in range(len(tops))]
+
+    def given(self, k: int, crossing: Crossing, score: float, peak: "Peak") -> "Match":
+        """With a peak of one more field."""
+        m, V = self.shifts.of(k)
+        before, after = np.linalg.inv(V), np.linalg.inv(peak.spread)
+        value, axes = np.linalg.eigh(after - before)
+        information = (axes * np.maximum(value, 0.0)) @ axes.T
+        pull = information @ m + (information + before) @ (peak.mean - m)
+        tie = Tie(crossing.knots, information, pull)
+        shifts = self.shifts.given(k, information, pull)
+        return Match(shifts, score, {**self.ties, k: tie}, (*self.misfits, peak.misfit))
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Of a field times what is predicted: mean [m], covariance [m^2], and squared residuals of its soundings."""
+
+    mean: Array
+    spread: Array
+    misfit: float
+
+
+def associate(
+    lines: Sequence[Line], crossings: Sequence[Crossing], prior: Shifts, relief: Relief, chart: SmoothedChart | None
+) -> tuple[list[Match], float]:
+    """The best combinations of peaks, best first, and how far was looked for [m].
+
+    Next comes the crossing that those before predict best.
+    """
+    step = float(np.clip(GRID * relief.length, *STEPS_M))
+    matches, widest, left = [Match(prior)], 0.0, set(range(len(crossings)))
+    while left:
+        unsure = {k: np.linalg.eigvalsh(matches[0].shifts.of(k)[1])[-1] for k in left}
+        k = min(unsure, key=lambda k: unsure[k])
+        far = max(SIGMAS * float(np.sqrt(unsure[k])), SAME_M)
+        most = CHART_M if crossings[k].earlier == CHART else FARTHEST_M
+        if far > most:
+            break
+        left.remove(k)
+        widest = max(widest, far)
+        predicted = np.array([match.shifts.of(k)[0] for match in matches])
+        spread = float(np.linalg.norm(predicted - predicted[0], axis=1).max())
+        reach = min(far + spread, FARTHEST_M) + BESIDE_M
+        own = _soundings_at(lines, crossings[k], predicted[0], reach, relief, chart)
+        axis = np.arange(-int(far / step) - 1, int(far / step) + 2)
+        window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        cells = np.round(predicted / step).astype(int)[:, None, None] + window
+        inside = np.array([m.far(k, step * own) for m, own in zip(matches, cells, strict=True)]) < SIGMAS
+        known, which = np.unique(cells[inside], axis=0, return_inverse=True)
+        field = np.full((2, *inside.shape), -np.inf)
+        field[:, inside] = np.array(own.at(np.asarray(known * step, float)))[:, which.reshape(-1)]
+        found = [
+            (score, peak, match)
+            for match, places, values, misfit in zip(matches, cells * step, *field, strict=True)
+            for score, peak in match.peaks(k, places, values, misfit)
         ]
-        return ties, self._gain(clear, sites, pulls), shown, self._misfit(misfit, shown)
-
-    @staticmethod
-    def _misfit(misfit: Array, shown: Array) -> float:
-        return float(np.mean(misfit[shown > SHOWS])) if (shown > SHOWS).any() else 0.0
-
-    def _gain(self, clear: NDArray[np.intp], sites: Sequence[Array], pulls: Sequence[Array]) -> float:
-        """Log likelihood of the soundings with the match over that without, by Laplace's method."""
-        own = (clear[:, None] * 2 + [0, 1]).ravel()
-        P, information = self._P[np.ix_(own, own)], np.zeros((len(own), len(own)))
-        for j, site in enumerate(sites):
-            information[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] = site
-        pull = np.concatenate(pulls) - information @ self._mean[own]
-        spread = np.eye(len(own)) + P @ information
-        away = np.linalg.solve(spread, P @ pull)  # of the match from what was predicted
-        at = (self._mean[own] + away).reshape(-1, 2)
-        shown = sum(float(_robust(self._fields[k].at(shift[None])[0])[0]) for k, shift in zip(clear, at, strict=True))
-        return shown - 0.5 * float(away @ np.linalg.solve(P, away)) - 0.5 * float(np.linalg.slogdet(spread)[1])
+        found.sort(key=lambda one: -one[0])
+        best = [one for one in found[:KEPT] if one[0] > found[0][0] - 2.0 * LEAD]
+        matches = [match.given(k, crossings[k], score, peak) for score, peak, match in best]
+    return matches, widest
 
 
 def _robust(field: Array) -> Array:
@@ -622,51 +744,29 @@ def _robust(field: Array) -> Array:
     return np.asarray(np.logaddexp(np.log1p(-FALSE) + field, np.log(FALSE)))
 
 
-def _peaks(values: Array) -> NDArray[np.bool_]:
-    """Local maxima of fields, shape (h, n, m)."""
-    wide = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    n, m = values.shape[1:]
-    out = np.isfinite(values)
-    for i in range(3):
-        for j in range(3):
-            out &= values >= wide[:, i : i + n, j : j + m]
-    return out
-
-
-def _clearest_first(P: Array) -> list[int]:
-    """An order of crossings: next comes what those before predict best."""
-    left = P.copy()
-    order: list[int] = []
-    count = len(P) // 2
-    while len(order) < count:
-        unsure = [np.inf if k in order else left[2 * k, 2 * k] + left[2 * k + 1, 2 * k + 1] for k in range(count)]
-        k = int(np.argmin(unsure))
-        order.append(k)
-        own = slice(2 * k, 2 * k + 2)
-        gain = np.linalg.solve(left[own, own] + PEAK_SD**2 * np.eye(2), left[own]).T
-        left = left - gain @ left[own]
-    return order
-
-
-def _most_alike(lines: Sequence[Line], relief: Relief, far: float) -> float:
-    """The largest correlation of profiles with themselves, further on than relief of their length lets expect."""
-    first = int(np.ceil(max(2.0 * relief.length, 3.0 * CELL_M) / CELL_M))
-    last = int(far / CELL_M)
-    product, square, pairs = np.zeros((3, max(last + 1, 1)))
-    for line in lines:
-        for side in np.unique(line.across):
-            own = line.across == side
-            z = np.full(np.ptp(line.along) + 1, np.nan)
-            z[line.along[own] - line.along.min()] = line.depth[own]
-            known = np.flatnonzero(np.isfinite(z))
-            if len(known) < STRETCH // 2:
-                continue
-            z[known] -= np.polyval(np.polyfit(known, z[known], 1), known)
-            for lag in range(first, min(last + 1, len(z) // 2 + 1)):
-                u, v = z[:-lag], z[lag:]
-                both = np.isfinite(u) & np.isfinite(v)
-                product[lag] += u[both] @ v[both]
-                square[lag] += 0.5 * (u[both] @ u[both] + v[both] @ v[both])
-                pairs[lag] += both.sum()
-    enough = pairs > 15
-    return float((product[enough] / np.maximum(square[enough], 1e-12)).max()) if enough.any() else 0.0
+def _repetition(lines: Sequence[Line], far: float) -> float:
+    """How far the correlation of lines of one direction with themselves rises again further on."""
+    way = np.array([np.arctan2(*(line.place[-1] - line.place[0])) for line in lines])
+    direction = np.round(way / (np.pi / 4.0)).astype(int) % 4
+    lags = np.arange(1, int(far / CELL_M) + 1)
+    most = 0.0
+    for some in range(4):
+        product, square, pairs = np.zeros((3, len(lags)))
+        for line in (lines[k] for k in np.flatnonzero(direction == some).tolist()):
+            for side in np.unique(line.across):
+                own = line.across == side
+                z = np.full(np.ptp(line.along[own]) + 1, np.nan)
+                z[line.along[own] - line.along[own].min()] = line.depth[own]
+                known = np.flatnonzero(np.isfinite(z))
+                if len(known) < STRETCH // 2:
+                    continue
+                z[known] -= np.polyval(np.polyfit(known, z[known], 1), known)
+                for j, lag in enumerate(lags[lags <= len(z) // 2]):
+                    u, v = z[:-lag], z[lag:]
+                    both = np.isfinite(u) & np.isfinite(v)
+                    product[j] += u[both] @ v[both]
+                    square[j] += 0.5 * (u[both] @ u[both] + v[both] @ v[both])
+                    pairs[j] += both.sum()
+        alike = (product / np.maximum(square, 1e-12))[pairs > ENOUGH_PAIRS]
+        most = max(most, float((alike - np.minimum.accumulate(alike)).max(initial=0.0)))
+    return most

@@ -53,6 +53,7 @@ from rovgraph.model.config_sections import (
     UNITS_TEXT,
     Angles,
     Beacon,
+    ChartSettings,
     ConfigSection,
     DateSettings,
     Delays,
@@ -301,6 +302,7 @@ class Config(ConfigSection):
     calibration: Calibration = Field(default_factory=Calibration)
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()
+    chart: ChartSettings = ChartSettings()
     online: OnlineSettings = OnlineSettings()
     columns: dict[str, str] = Field(default_factory=dict, description=COLUMNS_TEXT)
     units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)

@@ -619,6 +619,17 @@ class Graph(ConfigSection):
         return max(0.25 * self.max_gap_s, self.min_gap_s)
 
 
+class ChartSettings(ConfigSection):
+    """A chart of the bottom."""
+
+    file: str | None = Field(
+        None,
+        description="GeoTIFF of depths or heights in metres; soundings are compared with it, as with earlier lines",
+    )
+    sd_m: Positive = Field(0.5, description="error of a cell's depth, beside an offset of all")
+    position_sd_m: NotNegative = Field(1.0, description="how far the chart as a whole may be off, north and east")
+
+
 def _stamped(sensor: str) -> str:
     """Refuses what is no sensor, among them those that are registered."""
     known = (*STAMPED, *RegisteredSensors.model_fields)

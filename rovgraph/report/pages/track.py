@@ -35,6 +35,7 @@ def track_chart(source: DiveSource) -> Panel | Missing:
         *_fixes(source.residuals, source),
         *acoustic_traces(source),
         *_soundings(source),
+        *_crossings(source),
         *_silent(source),
         *coloured,
         *_ends(source),
@@ -188,6 +189,21 @@ def _soundings(source: DiveSource) -> list[Trace]:
     look: dict[str, Any] = {"visible": "legendonly", "text": text, "hoverinfo": "text"}
     when = packed(source.clock(few["time"].to_numpy(float)))
     return [points(f"soundings ({len(used)})", few["east"], few["north"], BOTTOM, size=3, t=when, **look)]
+
+
+def _crossings(source: DiveSource) -> list[Trace]:
+    """Where soundings of lines, or of a line and a chart, were compared."""
+    found = ((source.summary.get("estimates") or {}).get(source.main.kind) or {}).get("crossovers")
+    if not found:
+        return []
+    time, matched = np.asarray(found["time_s"], float), np.asarray(found["matched"], bool)
+    drawn = []
+    for name, some, colour in (("matched", matched, USED), ("not matched", ~matched, REJECTED)):
+        if some.any():
+            north, east = (np.interp(time[some], source.main["time"], source.main[c]) for c in ("north", "east"))
+            look = {"size": 9, "symbol": "circle-open", "t": packed(source.clock(time[some]))}
+            drawn.append(points(f"crossings, {name} ({int(some.sum())})", east, north, colour, **look))
+    return drawn
 
 
 def _ellipses(track: PageTrack) -> list[Trace]:
