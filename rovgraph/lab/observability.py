@@ -241,7 +241,7 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
 
 def rests_on_gyro(dive: Optimum) -> bool:
     """Whether no compass shows the heading, and the Earth's rotation is modelled."""
-    return dive.initial.config.environment.earth_rotation and not any(s in HEADING_STREAMS for s in dive.blocks)
+    return bool(dive.initial.config.environment.earth_rotation) and not any(s in HEADING_STREAMS for s in dive.blocks)
 
 
 def _with_others(joint: Array, calibration: Array) -> Array:
