@@ -200,9 +200,9 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     for key in ("gravity_mps2", "latitude_deg", "earth_rotation") if not flat else ("gravity_mps2",):
         del config["environment"][key]
     config = merge(config, {"environment": stated, "start": {"position_sd_m": 1.0}, "graph": {"max_gap_s": 2.5}})
-    stated = {f"dvl_{angle}": {"sd_deg": TILT_SD} for angle in ("roll", "pitch")}
-    stated["dvl_scale"] = {"estimate": True, "sd": SCALE_SD}
-    config = merge(config, {"calibration": stated, "dvl": {"mount_rpy_deg": [0.0, 0.0, 0.0]}})
+    mounting = {f"dvl_{angle}": {"sd_deg": TILT_SD} for angle in ("roll", "pitch")}
+    scale = {"estimate": True, "sd": SCALE_SD}
+    config = merge(config, {"calibration": {**mounting, "dvl_scale": scale}, "dvl": {"mount_rpy_deg": [0.0, 0.0, 0.0]}})
     if flat:
         config["environment"] |= {"latitude_deg": place[0], "earth_rotation": grade == "fog"}
     return Dive(streams, config, motion, hidden)
