@@ -329,8 +329,8 @@ def test_no_checkpoint_and_one_of_another_version_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_checkpoint(tmp_path / "missing")
     write_checkpoint(tmp_path / "a", {})
-    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 8 ", b"checkpoint 3 "))
-    with pytest.raises(InputError, match="of version 3, expected 8"):
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 9 ", b"checkpoint 3 "))
+    with pytest.raises(InputError, match="of version 3, expected 9"):
         read_checkpoint(tmp_path / "a")
 
 
