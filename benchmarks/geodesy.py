@@ -167,6 +167,7 @@ class Transit(Motion):
 
 
 SPEED, FIXED_S = 2.0, 60.0
+TILT_SD, SCALE_SD = 0.2, 0.003  # of the DVL's roll and pitch [deg], and of its scale
 
 
 def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = False, distance: float = 20e3) -> Dive:
@@ -182,7 +183,8 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     motion = Transit(seconds, heading, speeds, *tilt, 2.0, origin, flat=flat, step=0.1)
     vehicle = make_vehicle(grade, ("ahrs", "depth"))
     vehicle.imu = replace(vehicle.imu, rate=10.0)
-    vehicle.dvl = Dvl(rate=0.5, mount_rpy_deg=(0.0, 0.0, 0.0), yaw_sd=0.2)
+    tilted = rng.normal(0.0, TILT_SD, 2).tolist()
+    vehicle.dvl = Dvl(rate=0.5, mount_rpy_deg=(*tilted, 0.0), yaw_sd=0.2, scale_sd=SCALE_SD)
     vehicle.ahrs = replace(vehicle.ahrs, rate=0.5, offset_sd=0.5, curve_sd=0.3)
     vehicle.depth = replace(vehicle.depth, rate=0.5)
     streams, hidden = sample(motion, vehicle, rng)
@@ -198,6 +200,9 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
     for key in ("gravity_mps2", "latitude_deg", "earth_rotation") if not flat else ("gravity_mps2",):
         del config["environment"][key]
     config = merge(config, {"environment": stated, "start": {"position_sd_m": 1.0}, "graph": {"max_gap_s": 2.5}})
+    mounting = {f"dvl_{angle}": {"sd_deg": TILT_SD} for angle in ("roll", "pitch")}
+    scale = {"estimate": True, "sd": SCALE_SD}
+    config = merge(config, {"calibration": {**mounting, "dvl_scale": scale}, "dvl": {"mount_rpy_deg": [0.0, 0.0, 0.0]}})
     if flat:
         config["environment"] |= {"latitude_deg": place[0], "earth_rotation": grade == "fog"}
     return Dive(streams, config, motion, hidden)

@@ -25,7 +25,7 @@ from rovgraph.model.config import Config
 from rovgraph.model.origin import EarthOrigin, frame_of, lat_lon, north_east
 from rovgraph.model.state import State
 from rovgraph.problem.motion import preintegrate, preintegration_params
-from rovgraph.report.export.track import track_of
+from rovgraph.report.export.track import read_track
 from rovgraph.sensors.instruments import instruments
 from rovgraph.simulate.dive import specific_force_and_rate
 from rovgraph.simulate.path import Path as SimulatedPath
@@ -280,13 +280,13 @@ def test_results_keep_their_frame_and_those_of_before_are_flat(tmp_path):
     result = rovgraph.smooth(rovgraph.read_log(tmp_path / "log.csv", settings), settings)
     summary = result.save(tmp_path / "out", figures=False, page=False)
     assert summary["frame"] == "earth"
-    track = track_of(tmp_path / "out")
+    track = read_track(tmp_path / "out")
     assert isinstance(track.origin, EarthOrigin) and isinstance(result.track().origin, EarthOrigin)
     np.testing.assert_allclose(np.column_stack(track.lat_lon)[-1], truth[-1], atol=1e-7)
     assert isinstance(track.placed((60.0, 5.0), 0.0).origin, EarthOrigin)
     text = (tmp_path / "out" / "summary.json").read_text()
     (tmp_path / "out" / "summary.json").write_text(text.replace('"frame": "earth",', ""))
-    assert frame_of(track_of(tmp_path / "out").origin) == "flat"
+    assert frame_of(read_track(tmp_path / "out").origin) == "flat"
 
 
 @pytest.mark.parametrize(
