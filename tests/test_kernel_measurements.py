@@ -33,9 +33,9 @@ BEAM = np.array([-0.6, 0.0, 0.8])  # and how it goes with its angle
 CASES = {
     "dvl": (kernels.DVL, 3, ARM),
     "dvl_water": (kernels.DVL_WATER, 3, ARM),
-    "dvl_compass": (kernels.DVL_COMPASS, 1, [0.1, *DVL_COMPASS, layout.DVL_COMPASS_ERROR, 0.0, 0.0, 0.0]),
-    "compass": (kernels.COMPASS, 1, [0.1, *AHRS, layout.AHRS_ERROR, *TURN[:, 0]]),
-    "magnetometer": (kernels.MAGNETOMETER, 3, [0.1, 1.2, 0.5, *TURN.ravel()]),
+    "dvl_compass": (kernels.DVL_COMPASS, 1, [0.1, *DVL_COMPASS, layout.DVL_COMPASS_ERROR, *[0.0] * 5]),
+    "compass": (kernels.COMPASS, 1, [0.1, *AHRS, layout.AHRS_ERROR, *TURN[:, 0], 0.0, 0.0]),
+    "magnetometer": (kernels.MAGNETOMETER, 3, [0.1, 1.2, 0.5, *TURN.ravel(), 0.0, 0.0]),
     "depth": (kernels.POSITION, 1, [*ARM, layout.DEPTH_OFFSET, layout.DEPTH_SCALE, layout.DEPTH_ERROR, 2]),
     "fix": (kernels.POSITION, 2, [*ARM, -1, -1, layout.FIX_ERROR, 0, 1]),
     "place": (kernels.PLACE_OFFSET, 2, ARM),

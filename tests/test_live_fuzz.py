@@ -38,7 +38,7 @@ from rovgraph.model.config import Config
 TLOG = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_small.tlog.gz"
 LONGEST_FRAME = 293  # bytes of MAVLink
 # sensor -> its first column that may be NaN
-OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, "place": 1, "ship": 2, "usbl": 0, "range": 0, "dvl_beams": 0}
+OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, "place": 1, "ship": 2, "usbl": 0, "range": 0, "dvl_beams": 0, "adcp": 0}
 OPTIONAL |= dict.fromkeys(ON_EARTH, 2)
 
 RAPID = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -467,7 +467,10 @@ def test_the_assumptions_that_could_move_the_track_come_first_and_are_three():
 def test_the_words_by_which_assumptions_are_ranked_are_those_that_estimates_write():
     from rovgraph.report.assumptions import MATTERING
 
-    source = "".join(path.read_text(encoding="utf-8") for path in Path(rg.__file__).parent.glob("inference/*.py"))
+    package = Path(rg.__file__).parent
+    source = "".join(
+        path.read_text(encoding="utf-8") for path in (*package.glob("inference/*.py"), *package.glob("problem/*.py"))
+    )
     assert [words for words in MATTERING if words not in source] == []
 
 

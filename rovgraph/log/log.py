@@ -16,7 +16,7 @@ from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.tables import Table, read_table, table_of_arrays, table_of_frame, tables_of_keywords
 from rovgraph.model.config import Config, config_or_defaults
-from rovgraph.model.origin import Origin
+from rovgraph.model.origin import Origin, frame_of
 
 
 @dataclass(frozen=True, repr=False)
@@ -213,13 +213,16 @@ class Log:
         if self.config is None:
             return
         tables = "columns", "units", "angles", "times", "files", "delay_s", "imu.mag"
-        place = "environment.origin", "environment.frame", "environment.grid"
-        for key in (*tables, *place, "dvl.sound_speed_set_mps", "dvl.sound_speed_mps"):
-            if _entry(self.config, key) != _entry(config, key):
-                raise InputError(
-                    f"{self.source}: was read with another value of {key} than the configuration has; "
-                    "read it with this configuration"
-                )
+        keys = (*tables, "environment.origin", "environment.grid", "dvl.sound_speed_set_mps", "dvl.sound_speed_mps")
+        other = [key for key in keys if _entry(self.config, key) != _entry(config, key)]
+        frame = None if self.origin is None else frame_of(self.origin)
+        if frame is not None and config.environment.frame not in (frame, "auto"):
+            other.append("environment.frame")
+        if other:
+            raise InputError(
+                f"{self.source}: was read with another value of {other[0]} than the configuration has; "
+                "read it with this configuration"
+            )
 
     def measurements(self) -> Iterator[Measurement]:
         """Yield all measurements in the order of time; at equal times the IMU comes first, then the DVL.
