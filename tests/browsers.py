@@ -3,6 +3,7 @@
 import contextlib
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,14 @@ def chromium():
             pytest.skip("no browser was found: no page was opened; playwright install chromium-headless-shell gets one")
         yield browser
         browser.close()
+
+
+def until(page, expression: str, seconds: float = 20.0) -> None:
+    """Wait for an expression of a page to be true; pages forbid the way in which Playwright waits."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"not within {seconds:g} s: {expression}"
+        page.wait_for_timeout(50)
 
 
 def printing_browser(program: Path, does: str = PRINTS) -> Path:

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from browsers import chromium
+from browsers import chromium, until
 from test_live_page import NASTY, solution
 
 import rovgraph as rg
@@ -73,14 +73,14 @@ def test_home_depth_and_heading_of_a_dive(browser, dive):
     for k in range(200):
         dive[0].send(solution(5.0 * k, 0.5 * k, position=np.array([0.5 * k, 2.0 + 0.5 * k, 3.0 + 0.01 * k])))
     page, errors = opened(browser, dive, 1600)
-    page.wait_for_function("rovgraph.map.state.time === 995")
+    until(page, "rovgraph.map.state.time === 995")
     home = page.inner_text(".gauge.home")
     assert "140.7 m" in home and "225°" in home
     assert "0:16:35" in page.inner_text("#times")
     assert page.evaluate("rovgraph.map.track.since(995 - 600).length") == 121
     assert "bottom" not in page.inner_text(".gauge.depth")
     dive[0].send(solution(1000.0, 100.0, altitude=4.0))
-    page.wait_for_function("rovgraph.map.state.time === 1000")
+    until(page, "rovgraph.map.state.time === 1000")
     assert "dashed: bottom" in page.inner_text(".gauge.depth")
     assert errors == []
 
@@ -91,9 +91,9 @@ def test_colours_and_sound_are_chosen_and_remembered(browser, dive):
     assert page.evaluate("document.documentElement.dataset.look") == "daylight"
     page.click("#look")
     page.click("#sound")
-    page.wait_for_function("document.getElementById('sound').textContent === 'Sound on'")
+    until(page, "document.getElementById('sound').textContent === 'Sound on'")
     dive[0].send(solution(2.0, position_sd=np.full(3, 9.0)))
-    page.wait_for_function("rovgraph.siren.played >= 2")  # the sound of the button, and the alarm
+    until(page, "rovgraph.siren.played >= 2")  # the sound of the button, and the alarm
     page.click("#sound")
     page.reload()
     page.wait_for_selector("#gauges b")
@@ -108,7 +108,7 @@ def test_no_sound_is_made_before_the_page_is_touched(browser, dive):
     assert page.inner_text("#sound") == "Sound: tap"
     assert page.evaluate("[rovgraph.siren.played, rovgraph.siren.context]") == [0, None]
     page.keyboard.press("x")
-    page.wait_for_function("rovgraph.siren.played === 1", timeout=20_000)  # repeated while it lasts
+    until(page, "rovgraph.siren.played === 1")  # repeated while it lasts
     assert errors == []
 
 

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from browsers import chromium
+from browsers import chromium, until
 from test_pages import dive, folder  # noqa: F401
 
 from rovgraph.api.reporting import report
@@ -112,7 +112,7 @@ def test_a_folded_part_is_drawn_when_it_is_opened(browser, page_file):
     residuals = "[...rovgraph.drawn.keys()].filter(key => key.startsWith('residuals-')).length"
     assert page.evaluate(residuals) == 0
     page.click("nav a[href='#residuals']")
-    page.wait_for_function(f"{residuals} > 0")
+    until(page, f"{residuals} > 0")
     context.close()
 
 
@@ -190,7 +190,7 @@ def test_zooming_one_time_axis_zooms_all(page):
 
 def test_contrast_names_and_keyboard_pass_axe(browser, page_file):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed: not tested")
-    context = browser.new_context(viewport={"width": 1200, "height": 900}, offline=True, bypass_csp=True)
+    context = browser.new_context(viewport={"width": 1200, "height": 900}, offline=True)
     page = context.new_page()
     page.goto(page_file.as_uri())
     page.evaluate("rovgraph.drawAll()")

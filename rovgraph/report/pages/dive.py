@@ -105,7 +105,7 @@ def _current(source: DiveSource) -> list[Item]:
         text = [f"{v:+.3f} ± {s:.3f} m/s at {z:.0f} m" for v, s, z in zip(value, sd, few["depth"], strict=True)]
         colours = [RAMP[k] for k in step.tolist()]
         look = {"size": 6, "symbol": "square", "text": text, "hoverinfo": "text", "showlegend": False}
-        trace = points(f"current {axis}", source.clock(few["time"].to_numpy(float)), few["depth"], colours, **look)
+        trace = points("knot at", source.clock(few["time"].to_numpy(float)), few["depth"], colours, **look)
         ramp = RAMP, f"{-fastest:.2f} m/s", f"{fastest:.2f} m/s"
         title, axes = f"Current {axis}", (source.clock.label, "depth [m]")
         drawn.append(Panel(title, *axes, [trace], wide=False, down=True, ramp=ramp))
