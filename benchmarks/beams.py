@@ -21,7 +21,7 @@ import pandas as pd
 from fault_campaign.beams import Beams, Bottom, Fault, Head, bias, lose, refuse, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, estimate_cells, row_options, run_command, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, estimate_cells, row_options, run_command, run_dive, tracks, write_dive
 from fault_campaign.motion import Profile
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
@@ -90,11 +90,7 @@ def make_dive(setting: Setting, seed: int) -> Dive:
 def inspect(folder: Path, dive: Dive) -> dict[str, float]:
     """What the rows need beside errors: the end, speed, beams that were used, what was found."""
     found: dict[str, float] = {}
-    for kind in ("smoothed", "filtered", "online"):
-        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
-        if not path.exists():
-            continue
-        track = pd.read_csv(path)
+    for kind, track in tracks(folder):
         last = track.iloc[-1]
         off = last[["north", "east"]].to_numpy(float) - dive.motion.local(np.array([last["time"]]))[0, :2]
         found[f"{kind} end"] = float(np.hypot(*off))

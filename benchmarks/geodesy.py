@@ -23,7 +23,7 @@ from fault_campaign import earth
 from fault_campaign.campaign import merge
 from fault_campaign.earth import Array
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, row_options, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, horizontal_error, row_options, run_dive, tracks, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Dvl, configuration, make_vehicle
 from scipy.stats import chi2
@@ -211,14 +211,9 @@ def transit(grade: str, place: tuple[float, float], seed: int, flat: bool = Fals
 def ends(folder: Path, dive: Dive) -> dict[str, float]:
     """Error and NEES of each estimate at the end."""
     found: dict[str, float] = {}
-    for kind in ("smoothed", "filtered", "online"):
-        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
-        if path.exists():
-            last = pd.read_csv(path).iloc[-1]
-            off = last[["north", "east"]].to_numpy(float) - dive.motion.local(np.array([last["time"]]))[0, :2]
-            both = last["cov_north_east"]
-            cov = np.array([[last["north_sd"] ** 2, both], [both, last["east_sd"] ** 2]])
-            found |= {f"{kind} end": float(np.hypot(*off)), f"{kind} nees": float(off @ np.linalg.solve(cov, off)) / 2}
+    for kind, track in tracks(folder):
+        off, cov = horizontal_error(dive, track.iloc[-1])
+        found |= {f"{kind} end": float(np.hypot(*off)), f"{kind} nees": float(off @ np.linalg.solve(cov, off)) / 2}
     return found
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, row_options, run_command, run_dive, write_dive
+from fault_campaign.judge import Dive, Result, row_options, run_command, run_dive, tracks, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import GRADES, Depth, Dvl, Vehicle, configuration
 from scipy.stats import chi2
@@ -93,11 +93,7 @@ def make_dive(setting: Setting, seed: int) -> Dive:
 def headings(folder: Path, dive: Dive) -> dict[str, float]:
     """Error of the heading and its sd at each moment, of each estimate [deg]."""
     found: dict[str, float] = {}
-    for kind in ("smoothed", "filtered", "online"):
-        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
-        if not path.exists():
-            continue
-        track = pd.read_csv(path)
+    for kind, track in tracks(folder):
         for moment in MOMENTS:
             row = track.iloc[min(int(track["time"].searchsorted(moment)), len(track) - 1)]
             off = np.rad2deg(row["yaw"] - dive.motion.heading(np.array([row["time"]]))[0])

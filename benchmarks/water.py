@@ -21,7 +21,17 @@ import numpy as np
 import pandas as pd
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Result, estimate_cells, honest_nees, row_options, run_dive, write_dive
+from fault_campaign.judge import (
+    Dive,
+    Result,
+    estimate_cells,
+    honest_nees,
+    horizontal_error,
+    row_options,
+    run_dive,
+    tracks,
+    write_dive,
+)
 from fault_campaign.motion import Motion, Profile, mounting
 from fault_campaign.vehicle import Dvl, configuration, make_vehicle
 from fault_campaign.water import Profiler, draw, profiles
@@ -143,24 +153,17 @@ def inspect(setting: Setting, folder: Path, dive: Dive) -> dict[str, float]:
     found: dict[str, float] = {}
     depth = dive.motion.local(np.arange(dive.motion.duration))[:, 2]
     lock = setting.lost[1] if setting.cliff else float(np.argmax(depth > depth.max() - LOCK_M))
-    for kind in ("smoothed", "filtered", "online"):
-        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
-        if path.exists():
-            track = pd.read_csv(path)
+    for kind, track in tracks(folder):
 
-            def off(time: float, track: pd.DataFrame = track) -> tuple[np.ndarray, np.ndarray]:
-                at = track.iloc[np.abs(track["time"] - time).argmin()]
-                ne = at[["north", "east"]].to_numpy(float) - dive.motion.local(np.array([at["time"]]))[0, :2]
-                return ne, np.array(
-                    [[at["north_sd"] ** 2, at["cov_north_east"]], [at["cov_north_east"], at["east_sd"] ** 2]]
-                )
+        def off(time: float, track: pd.DataFrame = track) -> tuple[np.ndarray, np.ndarray]:
+            return horizontal_error(dive, track.iloc[np.abs(track["time"] - time).argmin()])
 
-            wrong, cov = off(dive.motion.duration if kind == "smoothed" and not setting.cliff else lock - 1.0)
-            if setting.cliff:
-                found[f"{kind} way"] = float(np.hypot(*(wrong - off(setting.lost[0])[0])))
-            found[f"{kind} end"] = float(np.hypot(*wrong))
-            found[f"{kind} sd"] = float(np.sqrt(np.trace(cov)))
-            found[f"{kind} nees"] = float(wrong @ np.linalg.solve(cov, wrong)) / 2.0
+        wrong, cov = off(dive.motion.duration if kind == "smoothed" and not setting.cliff else lock - 1.0)
+        if setting.cliff:
+            found[f"{kind} way"] = float(np.hypot(*(wrong - off(setting.lost[0])[0])))
+        found[f"{kind} end"] = float(np.hypot(*wrong))
+        found[f"{kind} sd"] = float(np.sqrt(np.trace(cov)))
+        found[f"{kind} nees"] = float(wrong @ np.linalg.solve(cov, wrong)) / 2.0
     return found
 
 

@@ -12,8 +12,8 @@ import pytest
 from dives import altered, campaign_log, changed, kept, simulated, smoothed, without
 from live import flown
 from scipy.stats import chi2
+from test_cli_smooth import run
 
-from rovgraph.cli.app import main
 from rovgraph.diagnosis.check import examine
 from rovgraph.dive import smooth
 from rovgraph.errors import InputError
@@ -196,16 +196,6 @@ def test_online_waits_for_the_alignment_and_says_so():
     first = flight.solutions[0]
     off = wrap_angle(first.rpy[2] - case.truth.at(np.array([first.time])).rpy[0, 2])
     assert abs(off) < 3.0 * first.rpy_sd[2] < 15.0 * DEG
-
-
-def run(monkeypatch, *arguments):
-    """Run the console script, give its exit code."""
-    monkeypatch.setattr(sys, "argv", ["rovgraph", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def test_smooth_takes_a_log_without_heading_or_refuses_it_in_one_line(tmp_path, monkeypatch, capsys):

@@ -11,7 +11,7 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -200,6 +200,21 @@ def _smooth(folder: Path, dive: Dive) -> Result:
         track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
         _compare(result, kind, track, calibration[calibration["estimate"] == kind], dive)
     return result
+
+
+def tracks(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The tracks of a dive that was run in a folder, by estimate; "online" where it was replayed."""
+    for kind in ("smoothed", "filtered", "online"):
+        path = folder / ("live/trajectory_filtered.csv" if kind == "online" else f"out/trajectory_{kind}.csv")
+        if path.exists():
+            yield kind, pd.read_csv(path)
+
+
+def horizontal_error(dive: Dive, epoch: pd.Series) -> tuple[Array, Array]:
+    """Error north and east of an epoch of a track, shape (2,) [m], and its stated covariance, shape (2, 2) [m^2]."""
+    off = epoch[["north", "east"]].to_numpy(float) - dive.motion.local(np.array([epoch["time"]]))[0, :2]
+    both = epoch["cov_north_east"]
+    return off, np.array([[epoch["north_sd"] ** 2, both], [both, epoch["east_sd"] ** 2]])
 
 
 def _online(folder: Path, dive: Dive, result: Result) -> Result:
