@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
 from rovgraph.geometry import Array
-from rovgraph.inference.chart import Chart
+from rovgraph.inference.chart import DepthChart
 from rovgraph.inference.crossovers import Drift, lines_of, match
 
 KNOT_S = 20.0
@@ -180,7 +180,7 @@ class Case:
         return P[: 2 * count, : 2 * count], root[: 2 * count, : 2 * count]
 
 
-def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> Chart:
+def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> DepthChart:
     """A chart of the bottom in cells of a metre, with errors of 0.5 m and an offset of 2 m; with something wrong."""
     depth = terrain.depth[::2, ::2] + 2.0 + rng.normal(0.0, 0.5, terrain.depth[::2, ::2].shape)
     if change == "upside down":
@@ -189,7 +189,7 @@ def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> Chart:
         depth[spectrum(rng, depth.shape, 1.0, lambda k: np.exp(-((k * 8.0) ** 2))) > 0.5] = np.nan
     elif change == "elsewhere":
         depth = np.roll(depth, (300, 200), (0, 1))
-    return Chart(depth / 0.3048 if change == "feet" else depth, np.array(terrain.origin), 2.0 * terrain.cell, 0.5)
+    return DepthChart(depth / 0.3048 if change == "feet" else depth, np.array(terrain.origin), 2.0 * terrain.cell, 0.5)
 
 
 LINE = 2, 250.0, 25.0, 0

@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rovgraph.errors import InputError
-from rovgraph.inference.chart import Chart, read_chart
+from rovgraph.inference.chart import DepthChart, read_chart
 from rovgraph.inference.crossovers import Drift, Line, Tie, fit_relief, lines_of, match
 from rovgraph.model.config_sections import ChartSettings
 from rovgraph.report.pages.track import _crossings
@@ -128,7 +128,7 @@ def charted(seed: int, sd: float = 0.3):
     axis = np.arange(-20.0, 140.0)
     place = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
     z = depth(place.reshape(-1, 2)).reshape(160, 160)
-    return Chart(z + 1.5 + rng.normal(0.0, sd, z.shape), np.array([-20.0, -20.0]), 1.0, sd)
+    return DepthChart(z + 1.5 + rng.normal(0.0, sd, z.shape), np.array([-20.0, -20.0]), 1.0, sd)
 
 
 def lost(shift=(6.0, -4.0)):

@@ -3,7 +3,8 @@
 Depths of a chart count from its own datum, soundings from the surface: what lies between is not known and not needed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,7 +41,7 @@ class ChartFile:
     transform: Any
     crs: Any
 
-    def around(self, low: Array, high: Array, origin: Origin) -> "Chart":
+    def around(self, low: Array, high: Array, origin: Origin) -> "DepthChart":
         """The part between two places, shape (2,) each, north and east [m]."""
         from rasterio.warp import transform
         from scipy.ndimage import map_coordinates  # type: ignore[attr-defined]
@@ -60,11 +61,11 @@ class ChartFile:
         values = map_coordinates(self.values, cells_of(*grid), order=1, cval=np.nan).reshape(grid[0].shape)
         known = values[np.isfinite(values)]
         down = -1.0 if len(known) and np.median(known) < 0.0 else 1.0  # heights, as in most files
-        return Chart(down * values, low, step, self.settings.sd_m)
+        return DepthChart(down * values, low, step, self.settings.sd_m)
 
 
 @dataclass(frozen=True)
-class Chart:
+class DepthChart:
     """Depths on a grid.
 
     Attributes
@@ -132,7 +133,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class SmoothedChart(Chart):
+class SmoothedChart(DepthChart):
     """A chart whose errors are correlated.
 
     Attributes
@@ -162,6 +163,23 @@ def read_chart(settings: ChartSettings, origin: Origin | None) -> ChartFile | No
         raise InputError(f"{where}: there is no such file; paths count from where rovgraph runs")
     if origin is None:
         raise InputError(f"{where}: needs latitude and longitude of north = east = 0; state environment.origin_lat_deg")
+    with geotiff(path, where) as source:
+        if source.width * source.height > MOST_CELLS:
+            raise InputError(f"{where}: more than {MOST_CELLS:.0e} cells; cut out the part that you need")
+        if np.dtype(source.dtypes[0]).kind not in "iuf" or source.dtypes[0] == "uint8":
+            raise InputError(f"{where}: its first band has {source.dtypes[0]}, expected depths or heights in metres")
+        values = source.read(1, masked=True).astype(float).filled(np.nan)
+        return ChartFile(settings, values, source.transform, source.crs)
+
+
+@contextmanager
+def geotiff(path: Path, where: str) -> Iterator[Any]:
+    """A GeoTIFF with a coordinate system, as rasterio opens it; ``where`` begins the lines of errors.
+
+    Raises
+    ------
+    InputError : no rasterio, a file that cannot be read, or says no coordinate system
+    """
     try:
         import rasterio
         from rasterio.errors import RasterioError
@@ -171,13 +189,6 @@ def read_chart(settings: ChartSettings, origin: Origin | None) -> ChartFile | No
         with rasterio.open(path) as source:
             if source.crs is None:
                 raise InputError(f"{where}: says no coordinate system; assign one, as gdal_translate -a_srs does")
-            if source.width * source.height > MOST_CELLS:
-                raise InputError(f"{where}: more than {MOST_CELLS:.0e} cells; cut out the part that you need")
-            if np.dtype(source.dtypes[0]).kind not in "iuf" or source.dtypes[0] == "uint8":
-                raise InputError(
-                    f"{where}: its first band has {source.dtypes[0]}, expected depths or heights in metres"
-                )
-            values = source.read(1, masked=True).astype(float).filled(np.nan)
-            return ChartFile(settings, values, source.transform, source.crs)
+            yield source
     except RasterioError as error:
         raise InputError(f"{where}: is no GeoTIFF that can be read ({' '.join(str(error).split())[:200]})") from None

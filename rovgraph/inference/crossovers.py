@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.inference.chart import Chart, ChartFile, SmoothedChart
+from rovgraph.inference.chart import ChartFile, DepthChart, SmoothedChart
 from rovgraph.model.origin import Origin
 
 if TYPE_CHECKING:
@@ -430,7 +430,7 @@ def with_crossovers(
     return replace(estimate, trajectory=corrected, posterior=None), found
 
 
-def match(lines: Sequence[Line], drift: Drift, chart: Chart | None = None) -> Crossovers:
+def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) -> Crossovers:
     """Match all crossings of a survey's lines together.
 
     Parameters

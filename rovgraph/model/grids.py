@@ -13,6 +13,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 
 ELLIPSOID = "EPSG:4326"
+MARGIN_DEG = 6.0  # beyond the area that a grid is made for
 
 
 @cache
@@ -54,9 +55,6 @@ def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, 
                 f"northing {np.median(northing[known]):.0f}; state the grid of that place, and check which is which"
             )
     return lat, lon
-
-
-MARGIN_DEG = 6.0  # beyond the area that a grid is made for
 
 
 def convergence_and_scale(grid: str, lat: Array, lon: Array) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from starlette.routing import BaseRoute, Route
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.chart import geotiff
 from rovgraph.live.solution import Solution
 from rovgraph.model.origin import north_east
 
@@ -158,27 +159,16 @@ def _read(path: Path) -> Chart:
 
 
 def _geotiff(path: Path) -> ImageChart:
-    try:
-        import rasterio
+    with geotiff(path, f"--chart {path}") as source:
         from rasterio.enums import Resampling
-        from rasterio.errors import RasterioError
-    except ImportError:
-        raise InputError(f"--chart {path}: needs rasterio; install it with: pip install 'rovgraph[charts]'") from None
-    try:
-        with rasterio.open(path) as source:
-            if source.crs is None:
-                raise InputError(
-                    f"--chart {path}: says no coordinate system; assign one, as gdal_translate -a_srs does"
-                )
-            if any(np.issubdtype(kind, np.complexfloating) for kind in source.dtypes):
-                raise InputError(f"--chart {path}: has complex values; expected real ones, such as gdal_calc.py makes")
-            size = max(source.width, source.height)
-            shape = [max(1, round(n * min(1.0, LARGEST_PIXELS / size))) for n in (source.height, source.width)]
-            bands = source.read(out_shape=(source.count, *shape), resampling=Resampling.average, masked=True)
-            x, y = source.xy([0, 0, source.height], [0, source.width, 0], offset="ul")
-            corners = _corners(path, source.crs, x, y)
-    except RasterioError as error:
-        raise InputError(f"--chart {path}: is no GeoTIFF that can be read ({str(error)[:200]})") from None
+
+        if any(np.issubdtype(kind, np.complexfloating) for kind in source.dtypes):
+            raise InputError(f"--chart {path}: has complex values; expected real ones, such as gdal_calc.py makes")
+        size = max(source.width, source.height)
+        shape = [max(1, round(n * min(1.0, LARGEST_PIXELS / size))) for n in (source.height, source.width)]
+        bands = source.read(out_shape=(source.count, *shape), resampling=Resampling.average, masked=True)
+        x, y = source.xy([0, 0, source.height], [0, source.width, 0], offset="ul")
+        corners = _corners(path, source.crs, x, y)
     return ImageChart(path.name, _png(bands), corners)
 
 
