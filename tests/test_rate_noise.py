@@ -1,11 +1,11 @@
-"""The gyro's noise in the DVL's arm adds spurious information and draws the arm to zero; what is left is right."""
+"""The gyro's noise in the DVL's arm adds spurious information and draws arm and scale; what is left is right."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from dives import batch, falcon, interrupted, simulated, started
+from dives import batch, falcon, interrupted, renewed, simulated, started, without
 
 from rovgraph.dive import DiveEstimates, smooth
 from rovgraph.inference.chain_optimum import ChainOptimum
@@ -75,6 +75,19 @@ def test_an_estimated_arm_is_right_where_least_squares_is_off():
         least_squares.append((drawn - truth) / sd)
     assert (np.mean(np.square(off), axis=0) < FAR).all()
     assert np.mean(np.square(least_squares), axis=0).max() > FAR
+
+
+def test_noise_draws_no_scale_of_the_dvl_in_smoother_and_filter():
+    """Least squares and a filter linearised at its prediction are 3.5 sd too low on average."""
+    off = []
+    for seed in SEEDS[:6]:
+        config = falcon(calibration={"dvl_scale": {"estimate": True, "sd": 0.02}}, imu={"noise": {"gyr": 2.0 * USUAL}})
+        case = simulated(config, 200.0, seed=seed, style=CALM, calibration={"dvl_scale": 0.005})
+        log, config = without(case.log, "fix"), started(case)
+        found = [est.solve().calibration for est in (batch(log, config), renewed(log, config))]
+        scales = [one for rows in found for one in rows if one.label == "dvl_scale"]
+        off.append([(one.value - 0.005) / one.sd for one in scales])
+    assert (np.abs(np.mean(off, axis=0)) < 3.0 / np.sqrt(len(off))).all()
 
 
 def test_the_score_is_the_derivative_of_the_cost():

@@ -1,4 +1,4 @@
-"""Spurious information of the DVL's arm, by the gyro's noise.
+"""Spurious information of the DVL's arm, and what draws arm and scale, by the gyro's noise.
 
 A ping measures R_bs' (v + w x l) with the arm l, and the rate w is a gyro's, with an error e: errors in variables. The
 derivative by the arm has e in it, and so has the innovation, as e x l. Least squares then counts
@@ -9,6 +9,9 @@ as information of the arm, which is E [e]x' M [e]x, and draws it to zero by the 
 information of the vehicle's own rates remains: the corrected score (Nakamura 1990). For a vehicle that hardly rolls,
 with an IMU for autopilots, no information about the arm's z remains, however long the dive is. Noise that the estimate
 follows is not in the innovation, so M is reduced by the part of a ping's information that goes into its own prediction.
+
+The derivative by the DVL's scale, v + w x l, has e in it too: least squares draws the scale down by the score -l' F l.
+What the filter's prediction adds to that is in `rovgraph.kernels.correction.draw_no_scale`.
 """
 
 from dataclasses import dataclass
@@ -24,11 +27,12 @@ from rovgraph.problem.measurements import Measurements
 from rovgraph.sensors.dvl import DvlVelocity, dvl_mounting
 from rovgraph.sensors.dvl_beam import DvlBeam
 
-ARM = "dvl_lever_arm"
+ARM, SCALE = "dvl_lever_arm", "dvl_scale"
 WORTHLESS = 0.5  # share of spurious information beyond which what is left is worth little
 MOST = 0.25  # the same, up to which the arm may be estimated
 MOST_DRAWN = 5.0  # sds, up to which it may be estimated: what is taken off is right to a tenth
 MOST_DRAWN_UNCORRECTED = 1.0  # the same where nothing is taken off
+LEAST_DRAWN = 0.05  # sds, from which on the scale is worth a step
 ROUNDS = 3  # each leaves of the score's error the share of spurious information
 MOST_FOLLOWED = 0.2  # part of a ping's information that goes into its own prediction
 BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: not the noise of a gyro
@@ -42,10 +46,12 @@ class SpuriousInformation:
     ----------
     information : ndarray, shape (3,) [1/m^2]
     score : ndarray, shape (3,), that it takes from them [1/m]
+    scale_score : that it takes from the DVL's scale
     """
 
     information: Array
     score: Array
+    scale_score: float
 
     def share(self, sd: Array) -> Array:
         """Spurious share of the information of least squares with an sd [m]."""
@@ -67,7 +73,7 @@ class SpuriousInformation:
 
 def spurious_information(best: Optimum) -> SpuriousInformation:
     """F and F l of above in a dive, of the admitted measurements with their weights."""
-    information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
+    information, score, scale_score, followed = np.zeros(3), np.zeros(3), 0.0, _followed(best)
     dvl = {s: block for s, block in best.blocks.items() if isinstance(block.instrument.model, DvlVelocity | DvlBeam)}
     found = {sensor: _of_velocity(best, block) for sensor, block in dvl.items()}
     beams = sum((M.mean(axis=0) for sensor, M in found.items() if sensor in BEAM_SENSORS), np.zeros((3, 3)))
@@ -81,7 +87,8 @@ def spurious_information(best: Optimum) -> SpuriousInformation:
         arm = np.mean(_arm_b(block) + np.atleast_2d(best.state.calibration[ARM]), axis=0)
         information += np.diag(F)
         score += F @ arm
-    return SpuriousInformation(information, score)
+        scale_score += float(arm @ F @ arm)
+    return SpuriousInformation(information, score, scale_score)
 
 
 def _of_velocity(best: Optimum, block: Measurements) -> Array:
@@ -120,13 +127,16 @@ def noise_moves_arm(best: Optimum, sd: Array) -> bool:
     return bool(((spurious.share(sd) > MOST) | (spurious.drawn(sd) > most * sd)).any())
 
 
-def with_arm_of_rates(best: Optimum) -> Optimum:
-    """The optimum with an estimated arm as the vehicle's own rates show it; considered, where these show too little.
+def without_noise_of_rates(best: Optimum) -> Optimum:
+    """The optimum without what the gyro's noise takes from an estimated arm and scale of the DVL.
+
+    The arm is as the vehicle's own rates show it, and considered where these show too little.
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
+    best = _with_scale(best)
     if best.unknowns.walks.get(ARM) != 0.0:
         return best
     sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])
@@ -136,3 +146,12 @@ def with_arm_of_rates(best: Optimum) -> Optimum:
         for _ in range(ROUNDS):
             best = best.with_score(ARM, spurious_information(best).score)
     return best
+
+
+def _with_scale(best: Optimum) -> Optimum:
+    """The optimum with the score of the DVL's scale, where it is worth a step."""
+    if best.unknowns.walks.get(SCALE) != 0.0 or not isinstance(best, ChainOptimum):
+        return best
+    sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])[estimated_parts(best)[SCALE]]
+    score = np.array([spurious_information(best).scale_score])
+    return best.with_score(SCALE, score) if (score * sd > LEAST_DRAWN).all() else best

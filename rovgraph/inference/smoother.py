@@ -26,7 +26,7 @@ from rovgraph.inference.estimate import (
 from rovgraph.inference.faulty_intervals import CLEAR, Searches
 from rovgraph.inference.gauss_newton import rejects
 from rovgraph.inference.initialise import unseen
-from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, with_arm_of_rates
+from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, without_noise_of_rates
 from rovgraph.inference.observability import shown, shown_below, without_what_noise_moves
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.inference.posterior import Posterior
@@ -72,9 +72,9 @@ def optimum(
     if isinstance(best, ChainOptimum) and best.unknowns.considered and _contradicted(best):
         free = smooth_chain(problem, initial, states, calibration, freed=True)
         if _explains(free, best):
-            return with_arm_of_rates(_with_what_is_shown(free, best.unknowns.considered, hidden))
+            return without_noise_of_rates(_with_what_is_shown(free, best.unknowns.considered, hidden))
     seen = [name for name in shown(best) if name not in hidden]
-    return with_arm_of_rates(best.estimating(seen) if seen else best)
+    return without_noise_of_rates(best.estimating(seen) if seen else best)
 
 
 def _contradicted(best: ChainOptimum) -> bool:

@@ -39,16 +39,19 @@ from rovgraph.kernels.compile import helper
 from rovgraph.kernels.error_coordinates import ErrorColumns, change_basis, local, retract, turn_rows
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.filter_state import FilterModel, FilterState, retract_with_covariance
-from rovgraph.kernels.layout import TRANSLATION, VELOCITY
+from rovgraph.kernels.layout import DVL_ERROR, DVL_SCALE, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.linearization import LinearizationScratch, linearize_measurement, make_scratch, pick
 from rovgraph.kernels.measurement_row import (
     DIM,
+    GAIN,
     GATE,
     KIND,
     LOSS,
     LOSS_THRESHOLD,
     PRELINEARISED,
+    RATE_SD,
     READMIT,
+    SD,
     SEEN_FRAME,
     SEES,
     SEES_HEADING,
@@ -56,7 +59,7 @@ from rovgraph.kernels.measurement_row import (
     TIME,
     MeasuredRows,
 )
-from rovgraph.kernels.measurements import DVL_BEAM
+from rovgraph.kernels.measurements import DVL, DVL_BEAM, DVL_WATER, WATER_LAYER
 from rovgraph.kernels.states import epoch_in
 from rovgraph.kernels.weighting import loss_weight
 
@@ -577,6 +580,39 @@ def _one_beam_disagrees(measured: MeasuredRows, sensors: Array, found: Innovatio
 
 
 @helper
+def draw_no_scale(P: Array, measured: MeasuredRows, model: FilterModel, found: Innovations) -> None:
+    """Linearise what multiplies the DVL's velocity, its scale and its lasting error, where noise does not draw it.
+
+    The derivative by a scale is the velocity. The predicted one has errors in it that the innovation has, too: those
+    that the IMU's noise has brought into the prediction, and the rate's times the arm. Scales would be drawn down with
+    every ping (errors in variables). Of the whitened variance S + 1 of an innovation, c S is the IMU's and E the
+    rate's. In a steady state the derivative
+
+        H + (c S + E (1 + (1 - c) S)) / (S + 1) r
+
+    makes the expected sum over all pings vanish, what each does to later ones counted. c is 1 / 2n in a filter of what
+    noise is integrated to n times: down, once from the accelerometer's; along the other axes twice, from the gyro's by
+    way of tilt. ``found`` is renewed in place.
+    """
+    r, H, S, estimated = found.r, found.H, found.S, found.H.shape[1]
+    scales = model.column[MOTION + DVL_SCALE], model.column[MOTION + DVL_ERROR]
+    if not (0 <= scales[0] < estimated or 0 <= scales[1] < estimated):
+        return
+    for j in range(len(measured.which)):
+        row, sensor, begin = measured.rows[j], model.sensors[measured.which[j]], found.first[j]
+        if sensor[KIND] in (DVL, DVL_WATER, DVL_BEAM, WATER_LAYER):
+            for a in range(begin, found.first[j + 1]):
+                by_rate = sensor[GAIN + 4 * (a - begin)] * row[RATE_SD] * row[RATE_SD]
+                of_rate = by_rate / (by_rate + row[SD + a - begin] * row[SD + a - begin])
+                down, north, east = H[a, VELOCITY + 2] ** 2, H[a, VELOCITY] ** 2, H[a, VELOCITY + 1] ** 2
+                c = 0.25 + 0.25 * down / (down + north + east + 1e-300)
+                for i in scales:
+                    if 0 <= i < estimated and H[a, i] != 0.0:
+                        H[a, i] += (c * S[a, a] + of_rate * (1.0 + (1.0 - c) * S[a, a])) / (S[a, a] + 1.0) * r[a]
+    innovation_covariance(P, found)
+
+
+@helper
 def correct(
     known: FilterState,
     measured: MeasuredRows,
@@ -639,6 +675,7 @@ def correct(
     weights = Weights(loss, bend, np.empty(m), np.empty(first[m]), np.empty_like(S))
     if taken == 0 and widest(S) > WIDE * WIDE:
         relinearize(known, measured, model, weight_out, found, weights, scratch, behind)
+    draw_no_scale(P, measured, model, found)
     reweight(found, weights)
     joseph(P, B, found, weights, delta)
     for i in range(len(behind)):

@@ -45,7 +45,7 @@ from rovgraph.inference.gauss_newton import Gates
 from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate, refuse_layers
 from rovgraph.inference.graph.places import associated_optimum, resolved
 from rovgraph.inference.graph.values import CALIBRATION, key
-from rovgraph.inference.lever_arm_bias import with_arm_of_rates
+from rovgraph.inference.lever_arm_bias import without_noise_of_rates
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.smoother import newest_calibration, optimum, smoothed
 from rovgraph.kernels.assembly import SEGMENT
@@ -651,9 +651,9 @@ class IncrementalEstimator:
         best = associated_optimum(resolved(problem, self._numbers[seen]), *given)
         out = best.blocks[PLACE].believed & ~best.solution.gates[PLACE]
         if not out.any():
-            return with_arm_of_rates(best)
+            return without_noise_of_rates(best)
         apart = np.where(out, problem.number[seen], self._numbers[seen])
-        return with_arm_of_rates(associated_optimum(resolved(problem, apart), *given))
+        return without_noise_of_rates(associated_optimum(resolved(problem, apart), *given))
 
     def _take(self, count: int) -> int:
         """Take the newest keyframes of the assembly."""
