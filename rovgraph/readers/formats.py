@@ -37,6 +37,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "cerulean",
     "ad2cp",
     "nucleus",
+    "stdbin",
     "rosbag",
     "nmea",
     "gpx",
