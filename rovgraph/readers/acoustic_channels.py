@@ -142,6 +142,21 @@ def on_ships_grid(grid: Sequence[float], lat: float, lon: float) -> tuple[float,
     return found[0] if len(found) == 1 else None
 
 
+def places_to_state(source: str, places: Sequence[tuple[str, float, float, float]]) -> str:
+    """What a configuration states of beacons that a file places: names, latitudes, longitudes [deg], depths [m]."""
+    import pymap3d
+
+    origin = round(places[0][1], 7), round(places[0][2], 7)
+    beacons = []
+    for name, lat, lon, depth in places:
+        north, east, _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+        beacons.append(f"{{name: {name}, north_m: {north:.2f}, east_m: {east:.2f}, down_m: {depth:.2f}}}")
+    return (
+        f"{source}: has the places of its beacons; state environment: {{origin_lat_deg: {origin[0]}, origin_lon_deg: "
+        f"{origin[1]}}} and beacons: [{', '.join(beacons)}]"
+    )
+
+
 @dataclass
 class Heard:
     """What acoustic systems told, by its time.

@@ -38,6 +38,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "ad2cp",
     "nucleus",
     "stdbin",
+    "imc",
     "rosbag",
     "nmea",
     "gpx",

@@ -24,6 +24,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.stamps import DAY_S, unwrapped
 from rovgraph.log.streams import STREAMS, label_number
+from rovgraph.readers.acoustic_channels import places_to_state
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording, preferred_first, sound_of_dvl, too_slow
 from rovgraph.readers.records import gathered
@@ -337,8 +338,6 @@ def _name(text: bytes) -> str:
 
 def _ranges(blocks: Mapping[Block, Rows]) -> tuple[list[Channel], list[str]]:
     """Ranges to beacons, and what states where these are."""
-    import pymap3d
-
     parts = [blocks["external", bit].fresh() for bit in (14, 15, 16, 17) if ("external", bit) in blocks]
     if not parts:
         return [], []
@@ -353,19 +352,13 @@ def _ranges(blocks: Mapping[Block, Rows]) -> tuple[list[Channel], list[str]]:
         "range_beacon": np.array([label_number(name) if name else np.nan for name in names]),
         "range_sd": np.where(sd > 0.0, sd, np.nan),
     }
-    origin = round(float(values["lat"][0]), 7), round(_signed(float(values["lon"][0])), 7)
-    beacons = []
-    for name in dict.fromkeys(filter(None, names.tolist())):
-        at = values[names == name][-1]
-        north, east, _ = pymap3d.geodetic2ned(float(at["lat"]), _signed(float(at["lon"])), 0.0, *origin, 0.0)
-        beacons.append(
-            f"{{name: {name}, north_m: {north:.2f}, east_m: {east:.2f}, down_m: {-float(at['altitude']):.2f}}}"
-        )
-    said = (
-        f"LBL: the unit has its beacons at these places; state environment: {{origin_lat_deg: {origin[0]}, "
-        f"origin_lon_deg: {origin[1]}}} and beacons: [{', '.join(beacons)}]"
-    )
-    return [_channel("range", "LBL", columns)], [said]
+    places = {
+        name: (name, float(at["lat"]), _signed(float(at["lon"])), -float(at["altitude"]))
+        for name, at in zip(names.tolist(), values, strict=True)
+        if name
+    }
+    said = [places_to_state("LBL", list(places.values()))] if places else []
+    return [_channel("range", "LBL", columns)], said
 
 
 def _signed(longitude: float) -> float:
