@@ -328,7 +328,7 @@ class _Reader:
         for sensor, kind in (("mag", "MagneticField"), ("dvl", "GroundVelocity"), ("dvl_water", "WaterVelocity")):
             for source in self._chosen(sensor, kind):
                 rows = self.messages.rows(source)
-                valid = rows.values["valid"] & XYZ_VALID == XYZ_VALID if "valid" in rows.values.dtype.names else True
+                valid = True if sensor == "mag" else rows.values["valid"] & XYZ_VALID == XYZ_VALID
                 xyz = np.where(np.broadcast_to(valid, len(rows.time))[:, None], rows.xyz(), np.nan)
                 columns = {"time": rows.time, **dict(zip(STREAMS[sensor][:3], xyz.T, strict=True))}
                 if sensor == "dvl":
