@@ -158,6 +158,14 @@ FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
         "usbl_elevation counts upwards",
     ),
     "head's depth": (lambda d: d.streams["usbl"], {"usbl": {"lever_arm_m": [8, -2, 13]}}, "zero", "+10.00 m off"),
+    "range in feet": (
+        lambda d: altered(d.streams["usbl"], usbl_range=lambda t: t["usbl_range"] / 0.3048), {}, "unit",
+        "usbl_range is in feet",
+    ),
+    "place in feet": (
+        lambda d: by_place(d.streams["usbl"]).apply(lambda c: c if c.name == "time" else c / 0.3048), {}, "unit",
+        "usbl is in feet",
+    ),
     "own depth": (own_depth, {"usbl": {"frame": "ship"}}, "repeats", "that sensor's own"),
     "degrees": (
         lambda d: altered(
@@ -330,6 +338,7 @@ def beacons(*names: str) -> dict[str, Any]:
         ({"usbl": {"sound_speed_mps": 0.0}}, "usbl.sound_speed_mps: expected a speed of sound from 1300 to 1700 m/s"),
         ({"usbl": {"sound_speed_mps": 4921.0}}, "if it is in ft/s, state 1500"),
         ({"range": {"sound_speed_mps": 1299.0}}, "range.sound_speed_mps: expected a speed of sound"),
+        ({"sound": {"profile": [[0, 4921], [90, 4930]]}}, "in ft/s, multiply them by 0.3048"),
         ({"usbl": {"frame": "head"}}, "usbl.frame: expected"),
     ],
 )
@@ -342,6 +351,12 @@ def test_a_configuration_that_cannot_be_is_refused(command, dive, stated, words)
 @pytest.mark.parametrize("speed", [1300.0, 1700.0])
 def test_speeds_of_sound_in_water_are_taken(speed):
     assert believed({"usbl": {"sound_speed_mps": speed}}).usbl.sound_speed_mps == speed
+
+
+def test_a_depth_sensor_in_feet_is_named(dive):
+    depth = altered(dive.streams["depth"], depth=lambda t: t["depth"] / 0.3048)
+    (finding,) = [f for f in found(dive.read(dive.configuration, depth=depth), dive.configuration) if f.kind == "unit"]
+    assert (finding.sensor, finding.text.endswith("state units: {depth: ft}")) == ("depth", True)
 
 
 def several(t: Table) -> Any:
@@ -358,6 +373,7 @@ def degrees(column: str) -> Callable[[Table], Any]:
         ("usbl", {"usbl_beacon": several}, "2 transponders answer (3, 4); state which is the vehicle's"),
         ("usbl", {"usbl_bearing": degrees("usbl_bearing")}, "state units: {usbl_bearing: deg}"),
         ("usbl", {"usbl_elevation": degrees("usbl_elevation")}, "state units: {usbl_elevation: deg}"),
+        ("usbl", {"usbl_sound_speed": lambda t: 4921.0}, "state units: {usbl_sound_speed: ft/s}"),
         ("ship_heading", {"ship_heading": degrees("ship_heading")}, "state units: {ship_heading: deg}"),
         ("ship_heading", {"ship_roll": degrees("ship_roll"), "ship_pitch": degrees("ship_pitch")}, "{ship_tilt: deg}"),
     ],
@@ -369,7 +385,7 @@ def test_a_log_that_cannot_be_used_is_refused(command, dive, sensor, columns, wo
 
 
 def first_ten(column: str, value: float) -> dict[str, Callable[[Table], Any]]:
-    return {column: lambda t: np.where(np.arange(len(t)) < 10, value, t[column])}
+    return {column: lambda t: np.where(np.arange(len(t)) < 10, value, t.get(column, 1500.0))}
 
 
 @pytest.mark.parametrize(
@@ -377,6 +393,7 @@ def first_ten(column: str, value: float) -> dict[str, Callable[[Table], Any]]:
     [
         (first_ten("usbl_range", 0.0), {}, "10 of 29 replies (34.5%) are left out: range of 0 or less"),
         (first_ten("usbl_range", -1.0), {}, "10 of 29 replies (34.5%) are left out: range of 0 or less"),
+        (first_ten("usbl_sound_speed", 4921.0), {}, "10 of 29 replies (34.5%) are left out: a speed of sound in ft/s"),
         ({"usbl_beacon": several}, {"usbl": {"beacon": 9}}, "usbl.beacon is 9, the log has 3, 4"),
         (first_ten("usbl_elevation", 0.5 * np.pi), {}, "depths by range and direction"),  # right below is no fault
     ],

@@ -18,7 +18,7 @@ from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS, is_in_feet, is_of_water, look_at_sound_speed
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
 MOST_ELEVATION = 0.5 * np.pi + 1e-6
@@ -96,8 +96,9 @@ def _impossible(values: Array, config: Config) -> Masks:
     yield "farther than sound reaches", (r > FARTHEST_M) | (t > 2.0 * FARTHEST_M / SLOWEST_MPS)
     yield (
         f"a speed of sound beyond {SLOWEST_MPS:.0f} to {FASTEST_MPS:.0f} m/s",
-        (c > 0.0) & (c < SLOWEST_MPS) | (c > FASTEST_MPS),
+        (c > 0.0) & ~is_of_water(c) & ~is_in_feet(c),
     )
+    yield "a speed of sound in ft/s, by its size", is_in_feet(c)
 
 
 def _impossible_direction(values: Array, config: Config) -> Masks:
@@ -141,6 +142,15 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
     if plumb > max(OFTEN * len(values), 1):
         text = f"its elevation is 90 degrees in {plumb} of {len(values)} replies, which stands for none"
         yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
+
+
+def _look_at_replies(values: Array, config: Config) -> Iterator[Said]:
+    yield from _look_at_directions(values, config)
+    yield from look_at_sound_speed("usbl_sound_speed", values[:, -1])
+
+
+def _look_at_ranges(values: Array, config: Config) -> Iterator[Said]:
+    yield from look_at_sound_speed("range_sound_speed", values[:, -1])
 
 
 def _look_at_place(values: Array, config: Config) -> Iterator[Said]:
@@ -187,7 +197,7 @@ USBL = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_reply,
-    look=_look_at_directions,
+    look=_look_at_replies,
 )
 RANGE = Sensor(
     "range",
@@ -205,6 +215,7 @@ RANGE = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_range,
+    look=_look_at_ranges,
 )
 SHIP = Sensor(
     "ship",

@@ -41,6 +41,7 @@ from rovgraph.rules import ACOUSTIC_TRACK, BELIEVED_SDS, SURE, USUAL_SHARE, reme
 from rovgraph.sensors.acoustic import in_degrees
 from rovgraph.sensors.instruments import heading_sources, instruments
 from rovgraph.sensors.sensor import SENSORS
+from rovgraph.sensors.sound import FOOT_M
 
 FRAMES = "transducer", "ship", "north"
 MOST = 600  # replies that are compared, evenly
@@ -472,6 +473,25 @@ def _depth_errors(log: Log, config: Config, frame: str | None = None) -> tuple[A
     return (errors[inside], away[inside], seen) if inside.sum() >= MIN_FIXES else None
 
 
+def _in_feet(log: Log, config: Config, errors: Array, seen: Sightings) -> str:
+    """The column or group whose lengths are in feet by far smaller depth errors; "" = neither replies nor depths."""
+    time, depth = seen.positions.time, log["depth"]
+    inside = ~in_gap(time, depth.time, 5.0)
+    down = (seen.positions.data[:, 2] - seen.head[:, 2])[inside]
+    sensed = np.interp(time[inside], depth.time, depth["depth"])
+    by_range = bool(np.isfinite(log["usbl"]["usbl_range"]).any())
+    if not by_range and np.isnan(log["usbl"]["usbl_x"]).all():
+        return ""
+    tried = {
+        "usbl_range" if by_range else "usbl": errors - (1.0 - FOOT_M) * down,
+        "depth": errors + (1.0 - FOOT_M) * sensed,
+    }
+    off = {column: float(np.median(np.abs(each))) for column, each in tried.items() if column not in config.units}
+    column = min(off, key=lambda name: off[name], default="")
+    fits = column and OPPOSITE * max(off[column], DEPTH_OFF_M / OPPOSITE) < float(np.median(np.abs(errors)))
+    return column if fits else ""
+
+
 def _elevations_reversed(log: Log, config: Config) -> bool:
     """Whether depths by range and direction are far nearer to the depth sensor's with elevations of the other sign."""
     if "usbl" not in log:
@@ -495,6 +515,12 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", f"{text}upwards; state units: {{{_negated(config, column)}}}", "sign")
         return
     off = float(np.median(errors))
+    if column := _in_feet(log, config, errors, seen):
+        text = (
+            f"depths by range and direction are {off:+.1f} m off the depth sensor's: {column} is in feet; state units: "
+        )
+        yield Finding("depth" if column == "depth" else "usbl", "warning", f"{text}{{{column}: ft}}", "unit")
+        return
     noise = 1.4826 * float(np.median(np.abs(errors - off)))
     text = f"depths by range and direction are {off:+.2f} m off the depth sensor's (noise {noise:.2f} m)"
     length = float(np.median(np.linalg.norm(seen.positions.data[:, :3] - seen.head, axis=1)))
