@@ -128,6 +128,11 @@ def in_degrees(angles: Array) -> NDArray[np.bool_]:
     return np.asarray(beyond.sum(axis=0) > DEGREES * np.maximum(np.isfinite(angles).sum(axis=0), 1))
 
 
+def is_plumb(elevation: Array) -> NDArray[np.bool_]:
+    """Which elevations [rad] are 90 degrees, as systems write that have none, of the shape of ``elevation``."""
+    return np.asarray(np.abs(np.abs(elevation) - 0.5 * np.pi) < PLUMB)
+
+
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
     bearing, elevation = in_degrees(values[:, 2:4])
     if bearing or elevation:
@@ -138,8 +143,8 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
             f"its angles reach {largest:.4g} rad; if they are in degrees, state units: {{{key}: deg}}",
             "unit",
         )
-    plumb = int((np.abs(np.abs(values[:, 3]) - 0.5 * np.pi) < PLUMB).sum())
-    if plumb > max(OFTEN * len(values), 1):
+    plumb = int(is_plumb(values[:, 3]).sum())
+    if config.usbl.depth == "measured" and plumb > max(OFTEN * len(values), 1):
         text = f"its elevation is 90 degrees in {plumb} of {len(values)} replies, which stands for none"
         yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
 

@@ -98,7 +98,7 @@ class SoundSpeedProfile:
         if len(depth) < 2 or not (np.diff(depth) > 0.0).all() or depth[0] < -BEYOND_M:
             raise InputError(
                 "sound.profile: expected two or more depths that increase, in metres and positive down; "
-                "sort it by depth, or change the sign"
+                + _remedy_of_depths(depth)
             )
         if not (speed.min() > SLOWEST_MPS and speed.max() < FASTEST_MPS):
             raise InputError(
@@ -156,6 +156,16 @@ class SoundSpeedProfile:
             )
 
 
+def _remedy_of_depths(depth: Array) -> str:
+    if len(depth) < 2:
+        return "measure at another depth"
+    if np.median(depth) < 0.0:
+        return "change the sign of its depths, and sort it by them"
+    if len(np.unique(depth)) == len(depth):
+        return "sort it by depth"
+    return "keep one row of each depth, as of a cast's way down alone"
+
+
 def profile_of(rows: Sequence[tuple[float, float]] | str | None) -> SoundSpeedProfile | None:
     """A profile from rows of depth and speed, or a table's file; None = none.
 
@@ -182,7 +192,11 @@ def _read(path: Path) -> SoundSpeedProfile:
         raise InputError(f"{path}: cannot be read as a table of depth and sound_speed ({error})") from None
     table.columns = [str(name).strip().lower() for name in table.columns]
     if "depth" not in table or not ({"sound_speed"} <= {*table} or {"temperature", "salinity"} <= {*table}):
-        raise InputError(f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity")
+        found = ", ".join(table.columns)
+        raise InputError(
+            f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity, with commas between "
+            f"them; rename those that it has: {found[:100]}"
+        )
     columns = [name for name in ("depth", "sound_speed", "temperature", "salinity") if name in table]
     try:
         table = table[columns].dropna().astype(float)
