@@ -44,6 +44,7 @@ LARGEST_JUMP = 120.0  # [s]
 PIECE = 30.0  # shortest part of a dive that shows a lag [s]
 GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
 MOST_JUMPS = 5  # of one dive, that are bridged
+TOPSIDE = (*ACOUSTICS, "ship", "ship_heading", "ship_tilt")  # whose motion is not compared with the IMU's
 IN_ZONE = 0.8  # of the stamps, that a difference of time zones has to bring into the IMU's time
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
@@ -320,7 +321,7 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
                 delay = config.delay_s.get(sensor, 0.0) + shift[0]
                 text += f"; its motion matches the IMU's if moved {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s): "
                 text += f"state delay_s: {{{sensor}: {delay:.3f}}}"
-            elif zone := _time_zone(stream.time, first, last):
+            elif sensor in TOPSIDE and (zone := _time_zone(stream.time, first, last)):
                 text += f"; its stamps fit {zone / HOUR_S:+g} h, as those of local time: state delay_s: "
                 text += f"{{{sensor}: {config.delay_s.get(sensor, 0.0) + zone:g}}}"
             yield Finding(sensor, "error", text, "epoch")
