@@ -186,6 +186,11 @@ def test_fixes_without_a_valid_position_and_reckoned_ones_are_left_out(tmp_path)
     assert np.isnan(columns["fix_sd"]).tolist() == [False, True]
 
 
+def test_messages_of_another_size_are_counted(tmp_path):
+    recording = read(recorded() + packet(265, 2.0, bytes(8)), tmp_path)
+    assert ("of another size than their layout has", 1) in [(left.reason, left.count) for left in recording.left]
+
+
 def test_messages_of_other_systems_are_left_out_by_name(tmp_path):
     recording = read(recorded() + gps(1.0, system=GATEWAY), tmp_path)
     assert ("of another system than the one that logged", 1) in [(left.reason, left.count) for left in recording.left]

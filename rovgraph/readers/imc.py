@@ -38,6 +38,7 @@ LONGEST_S = 0.5  # between two samples of acceleration, that is interpolated to 
 POSITION_VALID, ACCURACY_VALID = 0x0004, 0x0020  # bits of a GPS fix
 RECKONED = (2, 3)  # types of GPS fixes: by dead reckoning, typed
 XYZ_VALID = 0x07
+ANOTHER_SIZE = "of another size than their layout has"
 USBL_FIX = "UsblFixExtended"
 TWICE = "of the same replies as what is used; choose usbl=NAME or fix=NAME"
 EVOLOGICS = (
@@ -144,7 +145,7 @@ class Imc:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         if content[: len(SYNC)] == BIG_ENDIAN:
             raise InputError(f"{path}: is an IMC log with the high byte first, which is not read; log it again by dune")
-        messages = Messages(content)
+        messages = Messages(content, left)
         told = 0
         for packet in _packets(content, left):
             messages.add(packet)
@@ -198,14 +199,14 @@ class Messages:
     beacons : name, latitude, longitude [rad], depth [m] of each, in the order in which ranges number them
     """
 
-    def __init__(self, content: mmap.mmap) -> None:
-        self._content = content
+    def __init__(self, content: mmap.mmap, left: Counter[tuple[str, str]]) -> None:
+        self._content, self._left = content, left
         self._found: dict[Source, tuple[array[float], array[int]]] = {}
         self.entities: dict[tuple[int, int], str] = {}
         self.beacons: list[tuple[str, float, float, float]] = []
 
     def add(self, packet: Packet) -> None:
-        """Take a message; one whose size is not that of its layout tells nothing."""
+        """Take a message; one whose size is not that of its layout is counted."""
         end = packet.at + packet.size
         try:
             if packet.number == ENTITY_INFO:
@@ -216,7 +217,7 @@ class Messages:
             else:
                 self._take(packet, end)
         except struct.error:
-            return
+            self._left["messages", ANOTHER_SIZE] += 1
 
     def _take(self, packet: Packet, end: int) -> None:
         kind, layout = (PLAIN | NAMED)[packet.number]
@@ -226,6 +227,8 @@ class Messages:
             times, places = self._found.setdefault(source, (array("d"), array("q")))
             times.append(packet.time)
             places.append(at)
+        else:
+            self._left["messages", ANOTHER_SIZE] += 1
 
     def _take_beacons(self, data: bytes) -> None:
         found, at = [], 3  # behind what it is for, and how many there are
@@ -289,13 +292,16 @@ class _Reader:
             if channel.sensor == "imu":
                 said += too_slow(channel.columns["time"], channel.source, "have dune log every sample of its IMU")
         fixes, replies = self._fixes(), self._usbl()
-        by_fix = "usbl" not in self.choose and any(channel.source.startswith(USBL_FIX) for channel in fixes)
-        for channel in replies if by_fix else [channel for channel in fixes if channel.source.startswith(USBL_FIX)]:
-            self.left[channel.source, TWICE] += len(channel.columns["time"])
-        if by_fix:
-            replies = []
-        elif replies:
-            fixes = [channel for channel in fixes if not channel.source.startswith(USBL_FIX)]
+        by_sound = [channel for channel in fixes if channel.source.startswith(USBL_FIX)]
+        if replies and by_sound:
+            unused = by_sound if "usbl" in self.choose else replies
+            for channel in unused:
+                self.left[channel.source, TWICE] += len(channel.columns["time"])
+            if "usbl" in self.choose:
+                fixes = [channel for channel in fixes if not channel.source.startswith(USBL_FIX)]
+            else:
+                replies = []
+        if replies:
             settings["usbl"] = {"head": "vehicle" if self.on_vehicle else "ship", "stamp": "arrival"}
             said.append(f"{replies[0].source}: {EVOLOGICS}")
         ranges = [self._channel("range", source, self._range(source)) for source in self._own("LblRange")]
