@@ -23,12 +23,13 @@ from fault_campaign.vehicle import configuration, make_vehicle
 
 from rovgraph.api.logs import read_log
 from rovgraph.diagnosis.check import Finding, acoustics, examine
+from rovgraph.diagnosis.check.clocks import overlap
 from rovgraph.errors import InputError
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import without_frozen
 from rovgraph.model.config import Config, parse_config
 
-CHECKS = acoustics.replies, acoustics.ship, acoustics.depths, acoustics.positions
+CHECKS = acoustics.replies, acoustics.ships, acoustics.ship, acoustics.depths, acoustics.positions
 Table = pd.DataFrame
 
 
@@ -158,6 +159,14 @@ FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
         "usbl_elevation counts upwards",
     ),
     "head's depth": (lambda d: d.streams["usbl"], {"usbl": {"lever_arm_m": [8, -2, 13]}}, "zero", "+10.00 m off"),
+    "range in feet": (
+        lambda d: altered(d.streams["usbl"], usbl_range=lambda t: t["usbl_range"] / 0.3048), {}, "unit",
+        "usbl_range is in feet",
+    ),
+    "place in feet": (
+        lambda d: by_place(d.streams["usbl"]).apply(lambda c: c if c.name == "time" else c / 0.3048), {}, "unit",
+        "usbl is in feet",
+    ),
     "own depth": (own_depth, {"usbl": {"frame": "ship"}}, "repeats", "that sensor's own"),
     "degrees": (
         lambda d: altered(
@@ -330,6 +339,10 @@ def beacons(*names: str) -> dict[str, Any]:
         ({"usbl": {"sound_speed_mps": 0.0}}, "usbl.sound_speed_mps: expected a speed of sound from 1300 to 1700 m/s"),
         ({"usbl": {"sound_speed_mps": 4921.0}}, "if it is in ft/s, state 1500"),
         ({"range": {"sound_speed_mps": 1299.0}}, "range.sound_speed_mps: expected a speed of sound"),
+        ({"sound": {"profile": [[0, 4921], [90, 4930]]}}, "in ft/s, multiply them by 0.3048"),
+        ({"sound": {"profile": [[60, 1490], [0, 1500]]}}, "positive down; sort it by depth"),
+        ({"sound": {"profile": [[0, 1490], [-60, 1500]]}}, "change the sign of its depths, and sort it by them"),
+        ({"sound": {"profile": [[0, 1500], [30, 1490], [0, 1500]]}}, "keep one row of each depth"),
         ({"usbl": {"frame": "head"}}, "usbl.frame: expected"),
     ],
 )
@@ -342,6 +355,12 @@ def test_a_configuration_that_cannot_be_is_refused(command, dive, stated, words)
 @pytest.mark.parametrize("speed", [1300.0, 1700.0])
 def test_speeds_of_sound_in_water_are_taken(speed):
     assert believed({"usbl": {"sound_speed_mps": speed}}).usbl.sound_speed_mps == speed
+
+
+def test_a_depth_sensor_in_feet_is_named(dive):
+    depth = altered(dive.streams["depth"], depth=lambda t: t["depth"] / 0.3048)
+    (finding,) = [f for f in found(dive.read(dive.configuration, depth=depth), dive.configuration) if f.kind == "unit"]
+    assert (finding.sensor, finding.text.endswith("state units: {depth: ft}")) == ("depth", True)
 
 
 def several(t: Table) -> Any:
@@ -358,6 +377,7 @@ def degrees(column: str) -> Callable[[Table], Any]:
         ("usbl", {"usbl_beacon": several}, "2 transponders answer (3, 4); state which is the vehicle's"),
         ("usbl", {"usbl_bearing": degrees("usbl_bearing")}, "state units: {usbl_bearing: deg}"),
         ("usbl", {"usbl_elevation": degrees("usbl_elevation")}, "state units: {usbl_elevation: deg}"),
+        ("usbl", {"usbl_sound_speed": lambda t: 4921.0}, "state units: {usbl_sound_speed: ft/s}"),
         ("ship_heading", {"ship_heading": degrees("ship_heading")}, "state units: {ship_heading: deg}"),
         ("ship_heading", {"ship_roll": degrees("ship_roll"), "ship_pitch": degrees("ship_pitch")}, "{ship_tilt: deg}"),
     ],
@@ -369,7 +389,7 @@ def test_a_log_that_cannot_be_used_is_refused(command, dive, sensor, columns, wo
 
 
 def first_ten(column: str, value: float) -> dict[str, Callable[[Table], Any]]:
-    return {column: lambda t: np.where(np.arange(len(t)) < 10, value, t[column])}
+    return {column: lambda t: np.where(np.arange(len(t)) < 10, value, t.get(column, 1500.0))}
 
 
 @pytest.mark.parametrize(
@@ -377,6 +397,7 @@ def first_ten(column: str, value: float) -> dict[str, Callable[[Table], Any]]:
     [
         (first_ten("usbl_range", 0.0), {}, "10 of 29 replies (34.5%) are left out: range of 0 or less"),
         (first_ten("usbl_range", -1.0), {}, "10 of 29 replies (34.5%) are left out: range of 0 or less"),
+        (first_ten("usbl_sound_speed", 4921.0), {}, "10 of 29 replies (34.5%) are left out: a speed of sound in ft/s"),
         ({"usbl_beacon": several}, {"usbl": {"beacon": 9}}, "usbl.beacon is 9, the log has 3, 4"),
         (first_ten("usbl_elevation", 0.5 * np.pi), {}, "depths by range and direction"),  # right below is no fault
     ],
@@ -414,6 +435,37 @@ def test_places_of_the_ship_in_another_unit_are_refused(dive):
         odd = pd.DataFrame({"time": ship["time"], "ship_lat": lat + 1e-3 * ship.index, "ship_lon": 2 * lat})
         with pytest.raises(InputError, match="expected degrees"):
             dive.read(dive.configuration, ship=odd)
+
+
+def test_two_ships_in_one_log_are_named(command, dive):
+    ship = dive.streams["ship"]
+    other = np.where(np.arange(len(ship)) % 2, 500.0, 0.0)
+    code, said = command(dive, dive.configuration, ship=ship.assign(ship_north=ship["ship_north"] + other))
+    assert (code, "its positions go to and fro by 500 m in" in said) == (0, True)
+
+
+def test_a_ship_with_one_position_and_replies_in_no_form_are_counted(command, dive):
+    code, said = command(dive, dive.configuration, ship=dive.streams["ship"].iloc[10:11])
+    assert (code, "left out: without a position of the ship" in said) == (0, True)
+    code, said = command(dive, dive.configuration, usbl=dive.streams["usbl"].drop(columns="usbl_range"))
+    assert (code, "expected all columns of one of its forms together" in said) == (0, True)
+
+
+@pytest.mark.parametrize("hours", [1.0, -5.5])
+def test_a_ship_in_local_time_is_told_by_how_much_and_the_remedy_works(command, dive, hours):
+    def local(table: Table) -> Table:
+        return table.assign(time=lambda t: t["time"] + 3600.0 * hours)
+
+    ship = {sensor: local(dive.streams[sensor]) for sensor in ("ship", "ship_heading")}
+    log = dive.read(dive.configuration, without=(), **ship)
+    said = {f.sensor: f.text for f in overlap(log, believed(dive.configuration)) if f.level == "error"}
+    assert {*said} == {"ship", "ship_heading", "ship_tilt"}
+    stated = dive.configuration
+    for text in said.values():
+        assert f"its stamps fit {hours:+g} h" in text
+        stated = followed(stated, text)
+    log = dive.read(stated, without=(), **ship)
+    assert not [f for f in overlap(log, believed(stated)) if f.level == "error"]
 
 
 def test_of_two_ships_in_two_files_one_is_taken_and_said(command, dive, tmp_path):

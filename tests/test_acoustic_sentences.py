@@ -428,6 +428,24 @@ def test_a_file_with_unknown_layouts_alone_is_refused_by_their_names(tmp_path):
         read(sentence("PSONDEP,120000.00,2401,99.9") * 3, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (SSB.replace("A,,", "A,NRy,"), "PSIMSSB: 20 error NRy: not a reply"),
+        (SSB.replace("10.0,20.0", "435600.0,5538800.0"), "PSIMSSB: 20 more than 20 km away"),
+        ("$" + SSB + "*00", "lines: 20 checksum"),
+        ("PSIMSSR,1200??.0,B01,1,2,3", "PSIMSSR: 20 its layout is not known"),
+    ],
+)
+def test_beside_sentences_without_a_reply_the_receiver_is_still_the_ships(line, why, tmp_path):
+    recording = read(dive(line), tmp_path)
+    assert [channel.sensor for channel in recording.channels] == ["ship", "ship_heading"]
+    (said,) = recording.warnings
+    assert f"no transponder was heard ({why}" in said
+    assert said.endswith("--choose fix=GPGGA if they are the vehicle's")
+    assert first(read(dive(line), tmp_path, fix="GPGGA"), "fix").source == "GPGGA"
+
+
 def test_filtered_positions_are_raw_only_where_that_is_chosen(tmp_path):
     data = dive(SSB.replace(",M,10", ",F,10"))
     assert first(read(data, tmp_path), "fix").source == "PSIMSSB B01"
@@ -582,6 +600,13 @@ def test_live_replies_are_fixes_where_they_are_filtered_or_their_axes_are_not_st
     close(values[-18:, :2], np.column_stack([file["fix_lat"], file["fix_lon"]])[-18:], atol=1e-9)
     assert len(of(messages, "usbl")[0]) == 0 and len(time) <= 20 + at_start
     assert any("is a fix" in text for text in heard.texts)
+
+
+def test_live_a_ship_is_known_by_a_sentence_without_a_reply():
+    lines = [_line(SSB.replace("??", "00").replace("A,,", "A,NRy,")), gga(1.0)]
+    source = nmea("n", Heard(), Config())
+    found = [m for line in lines for m in decoded(source, line)]
+    assert [reading.sensor for m in found for reading in m.readings] == [SHIP_GEODETIC]
 
 
 def test_live_no_replies_and_predicted_positions_are_told_and_left_out():

@@ -282,10 +282,12 @@ def test_a_speed_of_sound_of_each_measurement_takes_precedence():
     stream = replace(raw, time=5.0 + np.arange(3.0), data=row, row=np.arange(3))
     made = acoustics_of(parse_config("usbl: {turn_around_s: 0.05}")).exchanges(stream, 0.0, Counter())
     np.testing.assert_allclose(made.data[:, 0], [75.0, 72.5, 77.5])
-    row[:, -1] = [4900.0, 0.0, -1.0]  # the first in ft/s; those of 0 or less are not known
-    assert [bad.tolist() for why, bad in SENSORS["usbl"].refused(row, Config()) if why.startswith("a speed")] == [
-        [True, False, False]
-    ]
+    row[:, -1] = [4900.0, 0.0, 1800.0]  # of 0 or less is not known
+    refused = {why: bad.tolist() for why, bad in SENSORS["usbl"].refused(row, Config()) if why.startswith("a speed")}
+    assert refused == {
+        "a speed of sound in ft/s, by its size": [True, False, False],
+        "a speed of sound beyond 1300 to 1700 m/s": [False, False, True],
+    }
 
 
 def test_a_profile_is_read_from_rows_and_files_and_what_is_none_is_refused(tmp_path):

@@ -13,6 +13,7 @@ from rovgraph.log import Log
 from rovgraph.log.companions import beams_of_table
 from rovgraph.log.tables import table_of_arrays
 from rovgraph.model.config import Config, beliefs, parse_config
+from rovgraph.sensors import SENSORS
 from rovgraph.sensors.dvl_beam import PHASED_C0, beam_geometry, beams_of, velocity_by_beams
 from rovgraph.sensors.sound import sound_speed
 
@@ -130,3 +131,14 @@ def test_a_remus_is_two_percent_slower_than_its_dvl_believed():
     ratio = corrected["dvl"].data[:, :3][fast] / believed["dvl"].data[:, :3][fast]
     assert ratio.min() == pytest.approx(0.976, abs=5e-4) and ratio.max() == pytest.approx(0.981, abs=5e-4)
     assert 0.976 <= np.median(ratio) <= 0.981
+
+
+def test_a_logged_speed_in_feet_is_named_and_never_corrects():
+    config, time = parse_config("dvl: {sound_speed_set_mps: logged, sound_speed_mps: 1470}"), np.arange(10.0)
+    read = Log.from_arrays(
+        {"time": time, "dvl_sound_speed": np.full(10, 4921.0)}, time=time, dvl=np.tile(V, (10, 1)), config=config
+    )
+    np.testing.assert_array_equal(read["dvl"].data[:, :3], np.tile(V, (10, 1)))
+    (said,) = SENSORS["dvl_sound"].look(read["dvl_sound"].data, config)
+    assert said[0] == "error"
+    assert "state units: {dvl_sound_speed: ft/s}" in said[1]

@@ -14,8 +14,10 @@ from autopilot_files import as_json, autopilot_messages, mcap, short_dive
 from doppler_files import dvl_record, nucleus_ahrs, nucleus_record, nucleus_track, pd4_frame, pd6_ping
 from test_api import command
 from test_guess_columns import mavlink as mavlink_table
+from test_imc_files import recorded as imc_recording
 from test_microstrain_files import as_export as microstrain_export
 from test_nmea_and_gpx_files import gga, gpx, rmc
+from test_stdbin_files import recorded as stdbin_recording
 from test_ugps_files import REAL as UGPS
 from test_vectornav_files import as_csv as vectornav_csv
 from test_vectornav_files import as_sentences as vectornav_sentences
@@ -68,6 +70,8 @@ MADE: dict[str, Callable[[], bytes]] = {
     "nucleus.bin": nucleus,
     "ship.nmea": lambda: rmc("120000.00", "020324") + b"".join(gga(f"1200{k:02d}.00", 0.001 * k) for k in range(9)),
     "track.gpx": gpx,
+    "Data.lsf": imc_recording,
+    "unit.stdbin": stdbin_recording,
     "ugps.csv": lambda: UGPS,
     "mtmanager.txt": xsens_export,
     "xsens.mtb": xsens_recording,

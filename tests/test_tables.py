@@ -109,6 +109,9 @@ CASES = {
     "units in the header": Case(
         table(depth=100 * TRUTH["depth"]).replace("depth,", "depth [cm],"), r"units by the header \(cm\)"
     ),
+    "feet in the header": Case(
+        table(depth=TRUTH["depth"] / 0.3048).replace("depth,", "depth [feet],"), r"units by the header \(ft\)"
+    ),
     "units in the second line": Case(
         with_units(table(depth=100 * TRUTH["depth"])), r"with units in line 2; units by the header \(s, cm, deg\)"
     ),
@@ -116,7 +119,7 @@ CASES = {
         german(table(";")).replace(";4,", ";4.", 3), "'4.[0-9]*' may be 4[0-9]* or 4.[0-9]*, as the file has", True
     ),
     "a unit that is not known": Case(
-        table().replace("depth,", "depth [ft],"), "unknown unit 'ft', expected one of m", True
+        table().replace("depth,", "depth [fathoms],"), "unknown unit 'fathoms', expected one of m", True
     ),
     "units of the configuration": Case(
         table(depth=100 * TRUTH["depth"]).replace("depth,", "depth [mm],"), config="units: {depth: cm}"

@@ -72,7 +72,7 @@ def run() -> NoReturn:
 def main() -> None:
     """Run the command that the arguments name."""
     limit_threads_and_gc()
-    warnings.simplefilter("always", DataWarning)
+    warnings.simplefilter("default", DataWarning)
     warnings.showwarning = _show_warning
     try:
         try:

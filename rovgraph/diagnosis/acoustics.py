@@ -110,7 +110,7 @@ class _LagSearch:
 
     def __init__(self, log: Log, replies: Stream, time: Array, states: State, initial: InitialConditions) -> None:
         self.log, self.replies, self.time, self.states, self.initial = log, replies, time, states, initial
-        self.acoustics = Acoustics(initial.config, initial.instruments)
+        self.acoustics = Acoustics(initial.config, initial.instruments, warns=False)
         self.acoustics.take_ship(log.streams)
         self.calibration = {name: b.mean for name, b in initial.beliefs.items()}
 

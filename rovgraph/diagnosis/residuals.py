@@ -290,8 +290,16 @@ def left_out(evidence: Evidence) -> Iterator[Statistic]:
             evidence.end,
             share,
             f"{share:.0%} of its measurements were left out: {why}",
-            "check its unit and that limit" if "." in why else "check the instrument and its driver",
+            _remedy_of_left_out(why),
         )
+
+
+def _remedy_of_left_out(why: str) -> str:
+    if why.endswith("of the ship"):
+        return "record the ship all the time, or raise ship.max_gap_s"
+    if "transponder" in why:
+        return "name the vehicle's, usbl: {beacon: ...}, as usbl_beacon has it"
+    return "check its unit and that limit" if "." in why else "check the instrument and its driver"
 
 
 def correlated_residuals(evidence: Evidence) -> Iterator[Statistic]:

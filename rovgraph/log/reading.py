@@ -515,9 +515,10 @@ def _select(
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
     if partly.any():
+        expected = ", ".join(required) or "all columns of one of its forms"
         warn(
-            f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected "
-            f"{', '.join(required)} together; first in line {line[np.argmax(partly)]}"
+            f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected {expected} together; first "
+            f"in line {line[np.argmax(partly)]}"
         )
     return data, complete
 

@@ -22,7 +22,8 @@ from rovgraph.sensors import SENSORS
 
 _DEG = float(np.deg2rad(1.0))
 _G = 9.80665  # standard gravity [m/s2]
-_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_FOOT = 0.3048  # [m]
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": _FOOT}
 _ANGLE = {"rad": 1.0, "deg": _DEG}
 
 # kind of quantity -> unit -> factor to the unit used inside
@@ -32,7 +33,7 @@ UNITS: dict[str, dict[str, float]] = {
     "rate": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG},
     "field": {"uT": 1.0, "nT": 1e-3, "mG": 0.1, "gauss": 100.0},
     "angle": _ANGLE,
-    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "ft/s": _FOOT},
     "length": _LENGTH,
     "area": {f"{unit}2": factor**2 for unit, factor in _LENGTH.items()},
     "pressure": {
@@ -69,6 +70,7 @@ _SPELLINGS = {  # as other programs write units, in small letters
     "deg/sec": "deg/s", "degrees/s": "deg/s", "degs": "deg/s", "radians": "rad", "degrees": "deg", "°": "deg",
     "e7": "dege7", "µt": "ut", "μt": "ut", "microtesla": "ut", "mgauss": "mg",
     "m²": "m2", "m^2": "m2", "meters": "m", "metres": "m", "meter": "m", "metre": "m",
+    "feet": "ft", "foot": "ft", "ft/sec": "ft/s", "feet/s": "ft/s", "fps": "ft/s", "ft²": "ft2", "ft^2": "ft2",
     "sec": "s", "secs": "s", "seconds": "s", "msec": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns",
 }  # fmt: skip
 _STATED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")

@@ -147,13 +147,14 @@ class Acoustics:
     ----------
     config : effective configuration
     instruments : the sensors in use
+    warns : of a vehicle below the end of the profile
 
     Attributes
     ----------
     heard : the newest range of each other end, by its place in ``beacons``, online
     """
 
-    def __init__(self, config: Config, instruments: Mapping[str, Instrument]) -> None:
+    def __init__(self, config: Config, instruments: Mapping[str, Instrument], warns: bool = True) -> None:
         self.config = config
         self.instruments = {s: i for s, i in instruments.items() if isinstance(i.model, AcousticExchange)}
         self.signals = {
@@ -173,7 +174,7 @@ class Acoustics:
         self._profile = profile_of(config.sound.profile)
         if self._profile is not None:
             self.signals["depth"] = ShipSignal(1, False)  # of the vehicle, where ranges are made with the speed between
-        self._deepest = -math.inf
+        self._deepest = -math.inf if warns else math.inf
         self._places = {label_number(str(beacon.name)): k for k, beacon in enumerate(config.beacons)}
         self._receivers = {label_number(name): np.array(arm) for name, arm in config.ship.receivers.items()}
 
@@ -626,7 +627,7 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     """
     if "usbl" not in log or config.usbl.head != "ship" or "usbl" not in instruments:
         return None
-    acoustics = Acoustics(config, instruments)
+    acoustics = Acoustics(config, instruments, warns=False)
     acoustics.take_ship(log.streams)
     stream = acoustics.exchanges(log["usbl"], late, Counter())
     z, sd, x = stream.data[:, :3], stream.data[:, 3:6], stream.data[:, 6 : 6 + at.WIDTH]

@@ -142,6 +142,21 @@ def on_ships_grid(grid: Sequence[float], lat: float, lon: float) -> tuple[float,
     return found[0] if len(found) == 1 else None
 
 
+def places_to_state(source: str, places: Sequence[tuple[str, float, float, float]]) -> str:
+    """What a configuration states of beacons that a file places: names, latitudes, longitudes [deg], depths [m]."""
+    import pymap3d
+
+    origin = round(places[0][1], 7), round(places[0][2], 7)
+    beacons = []
+    for name, lat, lon, depth in places:
+        north, east, _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+        beacons.append(f"{{name: {name}, north_m: {north:.2f}, east_m: {east:.2f}, down_m: {depth:.2f}}}")
+    return (
+        f"{source}: has the places of its beacons; state environment: {{origin_lat_deg: {origin[0]}, origin_lon_deg: "
+        f"{origin[1]}}} and beacons: [{', '.join(beacons)}]"
+    )
+
+
 @dataclass
 class Heard:
     """What acoustic systems told, by its time.
@@ -229,6 +244,8 @@ class ShipsFile:
         InputError : nothing of it can be placed
         """
         kept = self.compasses if "ahrs" in self.choose else []
+        if not (self.heard.replies or self.heard.positions or "fix" in self.choose):
+            return [*kept, *self._ship_alone()], {}, self.said
         direct = self._direct()
         if raw := self._raw(direct):
             channels, settings = self._as_measured(raw, direct)
@@ -281,6 +298,28 @@ class ShipsFile:
                 made[name] = self._channel(sensor, name, cells, "the ship's, from true north")
         order = sorted(made, key=lambda name: _is_slow(made[name].columns["time"]))
         return [made[name] for name in preferred_first(self.path, sensor, order, self.choose)]
+
+    def _ship_alone(self) -> list[Channel]:
+        """Channels of the ship, where no transponder was heard."""
+        if self.fixes or self.headings:
+            receiver = next(iter(self.receivers), "NAME")
+            self.said.append(
+                f"no transponder was heard ({self._why_not()}): positions and headings are taken as the ship's; "
+                f"--choose fix={receiver} if they are the vehicle's"
+            )
+        return [*self._receivers(), *self.headings, *self.tilts]
+
+    def _receivers(self) -> list[Channel]:
+        return [
+            self._channel("ship", name, {k.replace("fix", "ship"): v for k, v in self.fixes[name].columns.items()})
+            for name in self.receivers
+        ]
+
+    def _why_not(self) -> str:
+        """Why acoustic sentences, or lines that were none, are left out."""
+        return "; ".join(
+            f"{n}: {count} {why}" for (n, why), count in self.left.items() if n.startswith((*NAMES, "lines"))
+        )
 
     # positions on Earth
 
@@ -361,11 +400,7 @@ class ShipsFile:
             self.said.append(
                 f"{used[0].name} is filtered by the acoustic system, so its errors last: it follows turns late"
             )
-        ships = [
-            self._channel("ship", name, {k.replace("fix", "ship"): v for k, v in self.fixes[name].columns.items()})
-            for name in self.receivers
-        ]
-        return [*raw, *ships, *self.headings, *self.tilts], {"usbl": settings}
+        return [*raw, *self._receivers(), *self.headings, *self.tilts], {"usbl": settings}
 
     def _usbl(self, group: RepliesAlongAxes, names: Sequence[str]) -> Channel:
         """The channel of replies along the same axes."""
@@ -385,7 +420,6 @@ class ShipsFile:
         """Channels of fixes, of the transponders before those of the ship."""
         made = {**direct, **self._placed()}
         if not made and self.choose.get("fix") not in self.fixes:
-            why = "; ".join(f"{n}: {count} {reason}" for (n, reason), count in self.left.items() if n.startswith(NAMES))
             if self.receivers:
                 other = f"--choose fix={self.receivers[0]} if that receiver is the vehicle's"
             else:
@@ -393,8 +427,8 @@ class ShipsFile:
                     f'--choose usbl="{self.heard.names[0]}" if another file has the ship' if self.heard.names else ""
                 )
             raise InputError(
-                f"{self.path}: holds acoustic positions, but none that can be placed ({why}); record the ship's "
-                f"heading (HDT) and position beside them{', or say ' if other else ''}{other}"
+                f"{self.path}: holds acoustic positions, but none that can be placed ({self._why_not()}); record the "
+                f"ship's heading (HDT) and position beside them{', or say ' if other else ''}{other}"
             )
         labels = [*sorted(made, key=lambda name: -len(made[name].columns["time"])), *self.fixes]
         order = preferred_first(self.path, "fix", labels, self.choose)

@@ -510,13 +510,20 @@ _RANGE = struct.Struct("<IiH")  # count, time, distance [0.1 m]
 _ANGLES = struct.Struct("<hhh")  # azimuth, elevation [0.1 deg], fit error [0.01]
 
 
+def _crc16_of(byte: int) -> int:
+    for _ in range(8):
+        byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
+    return byte
+
+
+_CRC16 = [_crc16_of(byte) for byte in range(256)]
+
+
 def crc16(data: bytes) -> int:
     """CRC-16 with the polynomial 0xA001, from 0."""
     crc = 0
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+        crc = crc >> 8 ^ _CRC16[(crc ^ byte) & 0xFF]
     return crc
 
 

@@ -37,6 +37,8 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "cerulean",
     "ad2cp",
     "nucleus",
+    "stdbin",
+    "imc",
     "rosbag",
     "nmea",
     "gpx",

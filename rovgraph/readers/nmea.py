@@ -98,10 +98,11 @@ class _Sentences:
     Attributes
     ----------
     bare : no sentence has a checksum
+    beside_ship : there are acoustic sentences, told or not, so receivers and compasses are those of a ship
     """
 
     def __init__(self, bare: bool = False) -> None:
-        self.bare = bare
+        self.bare, self.beside_ship = bare, False
         self._times = SentenceTimes()
         self._undated = 0  # rows of `_clock` before a date is known
         self._clock = array("d")  # place, time
@@ -117,6 +118,7 @@ class _Sentences:
         self._place += 1
         try:
             if (acoustic := acoustic_sentence(line)) is not None:
+                self.beside_ship = True
                 self._acoustic(*acoustic)
                 return
             kind, text = sentence_of(line)
@@ -212,7 +214,7 @@ class _Sentences:
         notes = [] if clock.name != DAY else ["no sentence has a date: times count from midnight of the first day"]
         said = [NO_CHECKSUM] if self.bare else []
         settings: dict[str, Any] = {}
-        if self._told:
+        if self.beside_ship:
             heard = self._heard(place, time)
             file = ShipsFile(path, clock, options.choose, self._left, channels, heard)
             channels, settings, more = file.channels()

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.readers.acoustic_sentences import FARTHEST_M
 from rovgraph.readers.formats import ReadingOptions
 from rovgraph.readers.recording import Channel, Clock, Left, Recording, preferred_first
 from rovgraph.readers.records import Refused
@@ -67,18 +68,21 @@ def ugps_answer(row: Mapping[str, Any]) -> UgpsAnswer:
 
     Raises
     ------
-    Refused : a position without its coordinates
+    Refused : a position without its coordinates, or farther than sound is heard
     """
     cells = _flat(row)
     valid = _truth(next((cells[name] for name in VALID if name in cells), None))
     x, y, z = (_number(_either(cells, f"acoustic_{axis}", axis)) for axis in "xyz")
     if valid and not math.isfinite(x + y + z):
         raise Refused("no position", "valid, but without a coordinate")
+    if valid and math.hypot(x, y, z) > FARTHEST_M:
+        raise Refused("no position", f"valid, but more than {FARTHEST_M / 1e3:.0f} km away")
     heard = [_truth(_of_receiver(cells, "valid", k)) for k in range(RECEIVERS)]
     distances = [_number(_of_receiver(cells, "distance", k)) for k in range(RECEIVERS)]
     known = tuple(d if ok and d > 0.0 else math.nan for d, ok in zip(distances, heard, strict=True))
     lat, lon, heading = (_number(cells.get(f"master_{name}")) for name in ("lat", "lon", "orientation"))
-    fixed = _number(cells.get("master_fix_quality", 1)) > 0.0 and (lat, lon) != (0.0, 0.0)
+    on_earth = abs(lat) <= 90.0 and abs(lon) <= 180.0 and (lat, lon) != (0.0, 0.0)
+    fixed = _number(cells.get("master_fix_quality", 1)) > 0.0 and on_earth
     lat, lon = (lat, lon) if fixed else (math.nan, math.nan)
     topside = lat, lon, math.radians(heading) if 0.0 <= heading <= 360.0 else math.nan
     said = tuple(str(value) for name, value in cells.items() if name not in TIMES and not name.startswith(_OTHERS))

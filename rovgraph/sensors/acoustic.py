@@ -18,7 +18,7 @@ from rovgraph.model.config import Config
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
+from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS, is_in_feet, is_of_water, look_at_sound_speed
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
 MOST_ELEVATION = 0.5 * np.pi + 1e-6
@@ -96,8 +96,9 @@ def _impossible(values: Array, config: Config) -> Masks:
     yield "farther than sound reaches", (r > FARTHEST_M) | (t > 2.0 * FARTHEST_M / SLOWEST_MPS)
     yield (
         f"a speed of sound beyond {SLOWEST_MPS:.0f} to {FASTEST_MPS:.0f} m/s",
-        (c > 0.0) & (c < SLOWEST_MPS) | (c > FASTEST_MPS),
+        (c > 0.0) & ~is_of_water(c) & ~is_in_feet(c),
     )
+    yield "a speed of sound in ft/s, by its size", is_in_feet(c)
 
 
 def _impossible_direction(values: Array, config: Config) -> Masks:
@@ -127,6 +128,11 @@ def in_degrees(angles: Array) -> NDArray[np.bool_]:
     return np.asarray(beyond.sum(axis=0) > DEGREES * np.maximum(np.isfinite(angles).sum(axis=0), 1))
 
 
+def is_plumb(elevation: Array) -> NDArray[np.bool_]:
+    """Which elevations [rad] are 90 degrees, as systems write that have none, of the shape of ``elevation``."""
+    return np.asarray(np.abs(np.abs(elevation) - 0.5 * np.pi) < PLUMB)
+
+
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
     bearing, elevation = in_degrees(values[:, 2:4])
     if bearing or elevation:
@@ -137,10 +143,19 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
             f"its angles reach {largest:.4g} rad; if they are in degrees, state units: {{{key}: deg}}",
             "unit",
         )
-    plumb = int((np.abs(np.abs(values[:, 3]) - 0.5 * np.pi) < PLUMB).sum())
-    if plumb > max(OFTEN * len(values), 1):
+    plumb = int(is_plumb(values[:, 3]).sum())
+    if config.usbl.depth == "measured" and plumb > max(OFTEN * len(values), 1):
         text = f"its elevation is 90 degrees in {plumb} of {len(values)} replies, which stands for none"
         yield "warning", f"{text}: if the system has no elevation, state usbl: {{depth: given}}", "stuck"
+
+
+def _look_at_replies(values: Array, config: Config) -> Iterator[Said]:
+    yield from _look_at_directions(values, config)
+    yield from look_at_sound_speed("usbl_sound_speed", values[:, -1])
+
+
+def _look_at_ranges(values: Array, config: Config) -> Iterator[Said]:
+    yield from look_at_sound_speed("range_sound_speed", values[:, -1])
 
 
 def _look_at_place(values: Array, config: Config) -> Iterator[Said]:
@@ -187,7 +202,7 @@ USBL = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_reply,
-    look=_look_at_directions,
+    look=_look_at_replies,
 )
 RANGE = Sensor(
     "range",
@@ -205,6 +220,7 @@ RANGE = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_range,
+    look=_look_at_ranges,
 )
 SHIP = Sensor(
     "ship",

@@ -10,6 +10,7 @@ as at one speed of sound, `beam_sound_speed`, which is that of the beams' direct
 Pathfinder DVL Guide, speed of sound corrections.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +20,14 @@ from rovgraph.model.config import Config
 from rovgraph.model.config_sections import LOGGED, Dvl
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER
 from rovgraph.sensors.dvl_beam import BEAMS, DVL_BEAMS, PHASED_C0, QUANTITIES, beam_sound_speed
-from rovgraph.sensors.sensor import Column, Sensor
-from rovgraph.sensors.sound import profile_of, sound_speed
+from rovgraph.sensors.sensor import Column, Said, Sensor
+from rovgraph.sensors.sound import is_of_water, look_at_sound_speed, profile_of, sound_speed
 from rovgraph.sensors.water_layer import ADCP, ALONG, CELLS, EARTH, VELOCITIES
+
+
+def _look(values: Array, config: Config) -> Iterator[Said]:
+    yield from look_at_sound_speed("dvl_sound_speed", values[:, 0])
+
 
 DVL_SOUND = Sensor(
     "dvl_sound",
@@ -29,6 +35,7 @@ DVL_SOUND = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=lambda data: np.asarray(np.isfinite(data).any(axis=1)),
+    look=_look,
 )
 CORRECTED = tuple(sensor.name for sensor in (DVL, DVL_WATER, DVL_ALTITUDE, DVL_BEAMS, ADCP))
 
@@ -72,7 +79,8 @@ class SoundCorrection:
         """Speeds of sound that the DVL worked with, and of the water, shape (n,) each; NaN = not known [m/s]."""
         stated = self.dvl.sound_speed_set_mps
         logged = stated is None or stated == LOGGED
-        worked_with = water.set_speed if logged else np.full(len(water.depth), float(stated or np.nan))
+        heard = np.where(is_of_water(water.set_speed), water.set_speed, np.nan)
+        worked_with = heard if logged else np.full(len(water.depth), float(stated or np.nan))
         depth = np.nan_to_num(water.depth)
         if self.dvl.sound_speed_mps is not None:
             true = np.full(len(depth), self.dvl.sound_speed_mps)

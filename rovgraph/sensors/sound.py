@@ -7,18 +7,20 @@ goes through thin layers; with a constant gradient g the closed form that it is 
     t = arccosh(1 + g^2 (X^2 + dz^2) / (2 c1 c2)) / |g|
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.geometry import Array
 
 SLOWEST_MPS, FASTEST_MPS = 1300.0, 1700.0
+FOOT_M = 0.3048
 BAR_OF_M = 0.10198  # of water [bar/m]
 LAYER_M = 1.0  # of water that is taken as one
 BEYOND_M = 1.0  # the end of a profile, that a vehicle may go
@@ -61,6 +63,24 @@ def sound_speed(salinity: ArrayLike, temperature: ArrayLike, depth: ArrayLike) -
     return np.asarray(water + s * salt + s**1.5 * salt_15 + s**2 * salt_2)
 
 
+def is_of_water(speed: Array) -> NDArray[np.bool_]:
+    """Which speeds [m/s] sound has in water, of the shape of ``speed``."""
+    return np.asarray((speed >= SLOWEST_MPS) & (speed <= FASTEST_MPS))
+
+
+def is_in_feet(speed: Array) -> NDArray[np.bool_]:
+    """Which speeds are those of water in ft/s by their size, of the shape of ``speed``."""
+    return is_of_water(FOOT_M * speed)
+
+
+def look_at_sound_speed(column: str, speed: Array) -> Iterator[tuple[Literal["error"], str, Literal["unit"]]]:
+    """Whether a column of speeds of sound, shape (n,), NaN = none, is in ft/s."""
+    known = speed[speed > 0.0]
+    if 2 * int(is_in_feet(known).sum()) > len(known):
+        text = f"its speed of sound is {np.median(known):.0f}; if it is in ft/s, state units: {{{column}: ft/s}}"
+        yield "error", text, "unit"
+
+
 class SoundSpeedProfile:
     """Speed of sound by depth, linear between the depths that are given; beyond them it stays.
 
@@ -78,12 +98,13 @@ class SoundSpeedProfile:
         if len(depth) < 2 or not (np.diff(depth) > 0.0).all() or depth[0] < -BEYOND_M:
             raise InputError(
                 "sound.profile: expected two or more depths that increase, in metres and positive down; "
-                "sort it by depth, or change the sign"
+                + _remedy_of_depths(depth)
             )
         if not (speed.min() > SLOWEST_MPS and speed.max() < FASTEST_MPS):
             raise InputError(
                 f"sound.profile: speeds from {speed.min():.0f} to {speed.max():.0f}, expected {SLOWEST_MPS:.0f} to "
-                f"{FASTEST_MPS:.0f} m/s; 1 ft/s is 0.3048 m/s"
+                f"{FASTEST_MPS:.0f} m/s"
+                + (f"; if they are in ft/s, multiply them by {FOOT_M}" if is_in_feet(speed).all() else "")
             )
         self.depth, self.speed, self.water = depth, speed, water
 
@@ -135,6 +156,16 @@ class SoundSpeedProfile:
             )
 
 
+def _remedy_of_depths(depth: Array) -> str:
+    if len(depth) < 2:
+        return "measure at another depth"
+    if np.median(depth) < 0.0:
+        return "change the sign of its depths, and sort it by them"
+    if len(np.unique(depth)) == len(depth):
+        return "sort it by depth"
+    return "keep one row of each depth, as of a cast's way down alone"
+
+
 def profile_of(rows: Sequence[tuple[float, float]] | str | None) -> SoundSpeedProfile | None:
     """A profile from rows of depth and speed, or a table's file; None = none.
 
@@ -161,7 +192,11 @@ def _read(path: Path) -> SoundSpeedProfile:
         raise InputError(f"{path}: cannot be read as a table of depth and sound_speed ({error})") from None
     table.columns = [str(name).strip().lower() for name in table.columns]
     if "depth" not in table or not ({"sound_speed"} <= {*table} or {"temperature", "salinity"} <= {*table}):
-        raise InputError(f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity")
+        found = ", ".join(table.columns)
+        raise InputError(
+            f"{path}: expected columns depth and sound_speed, or depth, temperature and salinity, with commas between "
+            f"them; rename those that it has: {found[:100]}"
+        )
     columns = [name for name in ("depth", "sound_speed", "temperature", "salinity") if name in table]
     try:
         table = table[columns].dropna().astype(float)

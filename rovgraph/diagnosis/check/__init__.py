@@ -148,6 +148,7 @@ CHECKS: tuple[Check, ...] = (
     current,
     places,
     acoustics.replies,
+    acoustics.ships,
     acoustics.ship,
     acoustics.depths,
     acoustics.positions,

@@ -38,9 +38,10 @@ from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, beliefs
 from rovgraph.problem.acoustics import Acoustics, Sightings, sightings, unusable_acoustics
 from rovgraph.rules import ACOUSTIC_TRACK, BELIEVED_SDS, SURE, USUAL_SHARE, remedy_of_lag
-from rovgraph.sensors.acoustic import in_degrees
+from rovgraph.sensors.acoustic import in_degrees, is_plumb
 from rovgraph.sensors.instruments import heading_sources, instruments
 from rovgraph.sensors.sensor import SENSORS
+from rovgraph.sensors.sound import FOOT_M
 
 FRAMES = "transducer", "ship", "north"
 MOST = 600  # replies that are compared, evenly
@@ -52,6 +53,9 @@ EVIDENCE = 40.0  # and in chi-square
 AXIS = np.deg2rad(15.0)  # around a multiple of 90 deg, within which it is named
 TWICE = np.deg2rad(2.0)  # from which on an alignment that is applied twice is named
 TELLING = np.deg2rad(5.0)  # sd of the yaw, up to which it is reported
+MOSTLY = 0.5  # of the elevations, that stand for none
+FASTEST_SHIP_MPS, SHIP_JITTER_M = 15.0, 20.0  # of successive positions of one ship, by a receiver that is not good
+TWO_SHIPS = 0.1  # of the steps, from which on two ships are in a log
 OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
 DEPTH_OFF_M = 1.0
 GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
@@ -73,6 +77,8 @@ def usable(log: Log, config: Config, frame: str | None = None, late: float | Non
     """
     if "usbl" not in log or "usbl" in unusable_acoustics(config, log.sensors) or _wrong_unit(log):
         return None
+    if is_plumb(log["usbl"]["usbl_elevation"]).mean() > MOSTLY:
+        return None  # `replies` reports it
     if frame is not None and frame != config.usbl.frame:
         config = config.model_copy(update={"usbl": config.usbl.model_copy(update={"frame": frame})})
     replies = _sound(log, config)
@@ -472,6 +478,25 @@ def _depth_errors(log: Log, config: Config, frame: str | None = None) -> tuple[A
     return (errors[inside], away[inside], seen) if inside.sum() >= MIN_FIXES else None
 
 
+def _in_feet(log: Log, config: Config, errors: Array, seen: Sightings) -> str:
+    """The column or group whose lengths are in feet by far smaller depth errors; "" = neither replies nor depths."""
+    time, depth = seen.positions.time, log["depth"]
+    inside = ~in_gap(time, depth.time, 5.0)
+    down = (seen.positions.data[:, 2] - seen.head[:, 2])[inside]
+    sensed = np.interp(time[inside], depth.time, depth["depth"])
+    by_range = bool(np.isfinite(log["usbl"]["usbl_range"]).any())
+    if not by_range and np.isnan(log["usbl"]["usbl_x"]).all():
+        return ""
+    tried = {
+        "usbl_range" if by_range else "usbl": errors - (1.0 - FOOT_M) * down,
+        "depth": errors + (1.0 - FOOT_M) * sensed,
+    }
+    off = {column: float(np.median(np.abs(each))) for column, each in tried.items() if column not in config.units}
+    column = min(off, key=lambda name: off[name], default="")
+    fits = column and OPPOSITE * max(off[column], DEPTH_OFF_M / OPPOSITE) < float(np.median(np.abs(errors)))
+    return column if fits else ""
+
+
 def _elevations_reversed(log: Log, config: Config) -> bool:
     """Whether depths by range and direction are far nearer to the depth sensor's with elevations of the other sign."""
     if "usbl" not in log:
@@ -495,6 +520,12 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", f"{text}upwards; state units: {{{_negated(config, column)}}}", "sign")
         return
     off = float(np.median(errors))
+    if column := _in_feet(log, config, errors, seen):
+        text = (
+            f"depths by range and direction are {off:+.1f} m off the depth sensor's: {column} is in feet; state units: "
+        )
+        yield Finding("depth" if column == "depth" else "usbl", "warning", f"{text}{{{column}: ft}}", "unit")
+        return
     noise = 1.4826 * float(np.median(np.abs(errors - off)))
     text = f"depths by range and direction are {off:+.2f} m off the depth sensor's (noise {noise:.2f} m)"
     length = float(np.median(np.linalg.norm(seen.positions.data[:, :3] - seen.head, axis=1)))
@@ -537,6 +568,22 @@ def _is_given(log: Log, config: Config, seen: Sightings) -> bool:
     return expected > max(config.depth.sd_m, COARSE_M) / GIVEN and noise < GIVEN * expected
 
 
+def ships(log: Log, config: Config) -> Iterator[Finding]:
+    """Positions that go to and fro faster than a ship does: those of two."""
+    if "ship" not in log or len(log["ship"]) < MIN_FIXES:
+        return
+    place = log["ship"].data[:, :2]
+    step, over = np.diff(place, axis=0), place[2:] - place[:-2]  # to the next, and to the one after it
+    fast = np.linalg.norm(step, axis=1) > FASTEST_SHIP_MPS * np.diff(log["ship"].time) + SHIP_JITTER_M
+    back = fast[:-1] & fast[1:] & (np.linalg.norm(over, axis=1) < 0.5 * np.linalg.norm(step[:-1], axis=1))
+    if 2 * fast.sum() > TWO_SHIPS * len(fast) and back.any():
+        away = float(np.median(np.linalg.norm(step[fast], axis=1)))
+        text = (
+            f"its positions go to and fro by {away:.0f} m in {fast.sum()} of {len(fast)} steps, as those of two ships "
+        )
+        yield Finding("ship", "warning", f"{text}or receivers do; keep the rows of one", "contradiction")
+
+
 def ship(log: Log, config: Config) -> Iterator[Finding]:
     """The ship's heading against its course over ground."""
     if not {"ship", "ship_heading"} <= log.sensors or _wrong_unit(log):
@@ -564,7 +611,7 @@ def ship(log: Log, config: Config) -> Iterator[Finding]:
 
 def _courses(ship: Stream, heading: Stream) -> tuple[Array, Array]:
     """Courses over ground between means of some seconds, and the mean headings there, shape (k,) [rad]."""
-    edges = np.arange(ship.time[0], ship.time[-1], COURSE_S)
+    edges = np.arange(ship.time[0], ship.time[-1] + COURSE_S, COURSE_S)
     block = np.searchsorted(edges, ship.time, side="right") - 1
     n = np.maximum(np.bincount(block, minlength=len(edges)), 1)
     place = [np.bincount(block, ship.data[:, k], minlength=len(edges)) / n for k in (0, 1)]

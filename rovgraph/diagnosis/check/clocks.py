@@ -23,10 +23,11 @@ from rovgraph.diagnosis.check.inertial import GAP, GAP_OF_PERIODS, inertial_moti
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.errors import warn
+from rovgraph.geometry import Array
 from rovgraph.inference.gyrocompassing import why_not, without_turns
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import FrozenStretch, Runs, false_values, repeats, without
-from rovgraph.log.stamps import few_digits
+from rovgraph.log.stamps import HOUR_S, ZONES_S, few_digits
 from rovgraph.log.streams import GAP_PERIODS
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
@@ -43,6 +44,8 @@ LARGEST_JUMP = 120.0  # [s]
 PIECE = 30.0  # shortest part of a dive that shows a lag [s]
 GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
 MOST_JUMPS = 5  # of one dive, that are bridged
+TOPSIDE = (*ACOUSTICS, "ship", "ship_heading", "ship_tilt")  # whose motion is not compared with the IMU's
+IN_ZONE = 0.8  # of the stamps, that a difference of time zones has to bring into the IMU's time
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
 SMALL_S = 0.05  # difference of gap and jump up to which no samples are missing [s]
@@ -298,6 +301,12 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("log", level, f"no heading source in use: {known}", "missing")
 
 
+def _time_zone(time: Array, first: float, last: float) -> float:
+    """The one difference of time zones that stamps are ahead of a span; 0 = none, or several would do [s]."""
+    fits = [zone for zone in ZONES_S if np.mean((time - zone >= first) & (time - zone <= last)) > IN_ZONE]
+    return fits[0] if len(fits) == 1 else 0.0
+
+
 def overlap(log: Log, config: Config) -> Iterator[Finding]:
     """Sensors that share no time with the IMU."""
     if "imu" not in log:
@@ -312,6 +321,9 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
                 delay = config.delay_s.get(sensor, 0.0) + shift[0]
                 text += f"; its motion matches the IMU's if moved {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s): "
                 text += f"state delay_s: {{{sensor}: {delay:.3f}}}"
+            elif sensor in TOPSIDE and (zone := _time_zone(stream.time, first, last)):
+                text += f"; its stamps fit {zone / HOUR_S:+g} h, as those of local time: state delay_s: "
+                text += f"{{{sensor}: {config.delay_s.get(sensor, 0.0) + zone:g}}}"
             yield Finding(sensor, "error", text, "epoch")
         elif inside < 0.8:
             yield Finding(

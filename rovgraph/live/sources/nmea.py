@@ -158,10 +158,10 @@ class NmeaDecoder:
         Refused : it is not whole, or tells nothing that can be used
         """
         bare = self._takes_without_checksum(text) if text.startswith("$") and "," in text else False
-        tellings = told_by(kind, text, bare)
         if not self._of_ship:
             self._of_ship = True
             self._notify("ship", "fixes and headings beside acoustic sentences are taken as the ship's", True)
+        tellings = told_by(kind, text, bare)
         self._note_time(tellings[0].when, arrival)
         if self._recorded:
             if self._times.last is None:

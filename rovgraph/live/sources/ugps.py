@@ -20,10 +20,12 @@ from rovgraph.live.message import SHIP_GEODETIC, Message, Reading
 from rovgraph.live.sources.source import STOP_S, Chunk, LineDecoder, Notify
 from rovgraph.model.config import Config
 from rovgraph.readers.records import Refused, json_object
-from rovgraph.readers.ugps import UgpsAnswer, ugps_answer
+from rovgraph.readers.ugps import VALID, UgpsAnswer, ugps_answer
 from rovgraph.sensors import SENSORS
 
 LOCATOR, TOPSIDE = "position/acoustic/raw", "position/master"
+EXPECTED = {LOCATOR: VALID, TOPSIDE: ("lat",)}  # names of which each answer has one
+LOST_HTTP = 500
 RATE_HZ = 5.0  # the locator sends about twice a second
 TOPSIDE_S = 0.5  # between its answers
 TIMEOUT_S = 2.0 * STOP_S
@@ -59,16 +61,19 @@ class UgpsPolling:
         """What it answers; None where it does not."""
         try:
             with self._open(f"{self._base}/{path}", timeout=TIMEOUT_S) as response:
-                return json.loads(response.read(LONGEST))
+                answer = json.loads(response.read(LONGEST))
         except HTTPError as error:
-            self._notify(
-                f"HTTP {error.code}", f"{path}: HTTP {error.code}, as while the position is lost; trying again"
-            )
+            lost = "as while the position is lost; trying again" if error.code >= LOST_HTTP else "is this a UGPS?"
+            self._notify(f"HTTP {error.code}", f"{path}: HTTP {error.code}, {lost}")
         except (OSError, HTTPException) as error:
             reason = error.reason if isinstance(error, URLError) else error
             self._notify("unreachable", f"{path}: {getattr(reason, 'strerror', None) or reason}; trying again")
         except (ValueError, RecursionError):
             self._notify("not JSON", f"{path}: expected JSON; is this a UGPS?")
+        else:
+            if isinstance(answer, dict) and not answer.keys().isdisjoint(EXPECTED[path]):
+                return answer
+            self._notify("no answer", f"{path}: expected an object with {EXPECTED[path][0]}; is this a UGPS?")
         return None
 
 

@@ -30,6 +30,7 @@ Sureness = Literal["sure", "likely", "unsure"]
 STEP_S = 0.0005, 0.5  # of an IMU's samples [s]: each lasts less than the factor between two units of time
 SLOW_STEP_S = 0.02, 20.0  # of other rows
 SPEED = 0.05, 5.0  # of a vehicle, most of the time [m/s]
+METRIC = "m/s", "cm/s", "mm/s"  # units that a velocity may have unstated: in feet, a DVL and a depth agree as well
 DEEPEST = 12e3  # [m]
 SHALLOW = 100.0  # numbers of a depth up to this are taken for metres without other evidence
 WINDOW = 1.0  # [s]
@@ -170,7 +171,7 @@ def speeds_by_size(velocity: Array, stated: str) -> list[str]:
     if not len(velocity):
         return []
     speed = float(np.percentile(np.linalg.norm(velocity, axis=1), 90.0))
-    return [unit for unit, factor in UNITS["speed"].items() if SPEED[0] <= speed * factor <= SPEED[1]]
+    return [unit for unit in METRIC if SPEED[0] <= speed * UNITS["speed"][unit] <= SPEED[1]]
 
 
 def depths_by_size(depth: Array, stated: str) -> list[str]:
