@@ -25,7 +25,7 @@ from rovgraph.inference.estimate import (
 )
 from rovgraph.inference.faulty_intervals import CLEAR, Searches
 from rovgraph.inference.gauss_newton import rejects
-from rovgraph.inference.initialise import unseen
+from rovgraph.inference.resolve import unseen
 from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, with_arm_of_rates
 from rovgraph.inference.observability import shown, shown_below, without_what_noise_moves
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state

@@ -417,7 +417,7 @@ PLACES = "fix", "ship"  # that may come in latitude and longitude
 
 
 def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
-    """Leave out latitudes and longitudes that are none, and those beside which there are north and east.
+    """Leave out invalid latitudes and longitudes, and those beside which there are north and east.
 
     Raises
     ------
@@ -523,7 +523,7 @@ def _select(
 
 
 def _mend_columns(columns: Sequence[Column], data: Array, line: Lines, source: str) -> None:
-    """Sds that are none become NaN.
+    """Invalid sds become NaN.
 
     Raises
     ------

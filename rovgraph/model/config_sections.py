@@ -1,8 +1,9 @@
 """The sections of the configuration, with the keys and limits of each."""
 
 import datetime as dt
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,6 +51,18 @@ DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 
 class ConfigSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+
+    def with_values(self, **values: Any) -> Self:
+        """The same with other values, which are not checked; of a section a mapping of the keys that change."""
+        inside = {key: getattr(self, key) for key in values}
+        return self.model_copy(
+            update={
+                key: section.with_values(**values[key])
+                if isinstance(section, ConfigSection) and isinstance(values[key], Mapping)
+                else values[key]
+                for key, section in inside.items()
+            }
+        )
 
 
 class StartSettings(ConfigSection):

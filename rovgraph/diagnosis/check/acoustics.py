@@ -74,7 +74,7 @@ def usable(log: Log, config: Config, frame: str | None = None, late: float | Non
     if "usbl" not in log or "usbl" in unusable_acoustics(config, log.sensors) or _wrong_unit(log):
         return None
     if frame is not None and frame != config.usbl.frame:
-        config = config.model_copy(update={"usbl": config.usbl.model_copy(update={"frame": frame})})
+        config = config.with_values(usbl={"frame": frame})
     replies = _sound(log, config)
     if len(replies) > MOST:
         replies = replies.take(np.unique(np.linspace(0, len(replies) - 1, MOST).astype(int)))
@@ -222,9 +222,8 @@ class _Beside:
         seen = usable(log, config)
         if seen is None:
             return None
-        arm = config.fix.model_copy(update={"lever_arm_m": config.usbl.beacon_arm_m})
         positions = replace(seen.positions, sensor="fix")
-        track = tracks(_with(log, positions), config.model_copy(update={"fix": arm}))
+        track = tracks(_with(log, positions), config.with_values(fix={"lever_arm_m": config.usbl.beacon_arm_m}))
         if track is None or track.plane.count < MIN_FIXES:
             return None
         sources = {track.sensor, *heading_sources(config, log.sensors)}
@@ -232,10 +231,9 @@ class _Beside:
 
     def fit(self, late: float, axes: "_Axes") -> _Fit | None:
         """Fit with stamps that are late, in some axes; None with too few replies."""
-        usbl = self.config.usbl
-        roll, pitch, yaw = usbl.mount_rpy_deg
+        roll, pitch, yaw = self.config.usbl.mount_rpy_deg
         mount = roll, pitch, yaw + math.degrees(axes.yaw)
-        config = self.config.model_copy(update={"usbl": usbl.model_copy(update={"mount_rpy_deg": mount})})
+        config = self.config.with_values(usbl={"mount_rpy_deg": mount})
         log = _with(self.log, _signed(self.log["usbl"], bearing=-1.0)) if axes.mirrored else self.log
         seen = usable(log, config, axes.frame, late)
         if seen is None:
