@@ -515,10 +515,10 @@ def _select(
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
     if partly.any():
-        warn(
-            f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected "
-            f"{', '.join(required)} together; first in line {line[np.argmax(partly)]}"
-        )
+        expected = f"{', '.join(required)} together" if required else SENSORS[sensor].together
+        first = line[np.argmax(partly)]
+        left = f"{partly.sum()} rows partly empty and left out"
+        warn(f"{source}: {sensor}: {left}, expected {expected}; first in line {first}")
     return data, complete
 
 

@@ -127,7 +127,23 @@ def in_degrees(angles: Array) -> NDArray[np.bool_]:
     return np.asarray(beyond.sum(axis=0) > DEGREES * np.maximum(np.isfinite(angles).sum(axis=0), 1))
 
 
+def _look_at_ranges(values: Array, config: Config, key: str = "range") -> Iterator[Said]:
+    for k, limit, expected in (
+        (0, FARTHEST_M, f"if they are in millimetres, state units: {{{key}: mm}}"),
+        (1, 2.0 * FARTHEST_M / SLOWEST_MPS, "travel times are there and back, in seconds"),
+    ):
+        known = values[np.isfinite(values[:, k]), k]
+        if len(known) and (median := float(np.median(known))) > limit:
+            what, unit = ("ranges", "m") if k == 0 else ("travel times", "s")
+            yield (
+                "error",
+                f"its {what} are {median:.4g} {unit} in the median, farther than sound reaches; {expected}",
+                "unit",
+            )
+
+
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
+    yield from _look_at_ranges(values, config, "usbl_range")
     bearing, elevation = in_degrees(values[:, 2:4])
     if bearing or elevation:
         key = "usbl_direction" if bearing and elevation else "usbl_bearing" if bearing else "usbl_elevation"
@@ -187,6 +203,8 @@ USBL = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_reply,
+    together="usbl_bearing, usbl_elevation and usbl_range or usbl_travel_time, or usbl_x, usbl_y and usbl_z; "
+    "ranges alone are range or travel_time",
     look=_look_at_directions,
 )
 RANGE = Sensor(
@@ -205,6 +223,8 @@ RANGE = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_range,
+    together="range or travel_time",
+    look=_look_at_ranges,
 )
 SHIP = Sensor(
     "ship",

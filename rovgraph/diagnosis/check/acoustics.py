@@ -34,6 +34,7 @@ from rovgraph.diagnosis.check.inertial import in_gap
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log import Log, Stream
+from rovgraph.log.units import UNITS
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, beliefs
 from rovgraph.problem.acoustics import Acoustics, Sightings, sightings, unusable_acoustics
@@ -54,6 +55,7 @@ TWICE = np.deg2rad(2.0)  # from which on an alignment that is applied twice is n
 TELLING = np.deg2rad(5.0)  # sd of the yaw, up to which it is reported
 OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
 DEPTH_OFF_M = 1.0
+UNIT_FITS = 0.2  # logarithm of what another unit of the ranges leaves
 GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
 COARSE_M = 0.05  # noise of depths that are passed on with one digit
 NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
@@ -503,7 +505,10 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         priors["usbl_arm"].sd,
     )
     sd = 1.2533 * noise * math.sqrt(inflation((errors - off).astype(np.complex128)) / len(errors))
-    if abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
+    unit = _unit_of_ranges(seen, errors)
+    if unit is not None:
+        yield Finding("usbl", "warning", f"{text}: state units: {{{unit}}}", "unit")
+    elif abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
         x, y, z = config.usbl.lever_arm_m
         text += f": check the head's depth below the waterline, usbl.lever_arm_m: [{x:g}, {y:g}, {z - off:.1f}] would "
         yield Finding("usbl", "warning", f"{text}mend it, and the elevation and the sound speed", "zero")
@@ -512,6 +517,16 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", text, "repeats")
     else:
         yield Finding("usbl", "ok", text)
+
+
+def _unit_of_ranges(seen: Sightings, errors: Array) -> str | None:
+    """The unit of ranges, as ``units`` states it, that makes depths below the head those of the depth sensor."""
+    below = float(np.median(seen.positions.data[:, 2] - seen.head[:, 2]))
+    ratio = below / (below - float(np.median(errors))) if below != np.median(errors) else 0.0
+    if ratio <= 0.0 or abs(math.log(ratio)) < math.log(2.0):
+        return None
+    near = (u for u, factor in UNITS["length"].items() if u != "m" and abs(math.log(ratio * factor)) < UNIT_FITS)
+    return next((f"usbl_range: {unit}" for unit in near), None)
 
 
 def _is_given(log: Log, config: Config, seen: Sightings) -> bool:
