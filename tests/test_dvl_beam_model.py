@@ -384,6 +384,15 @@ def test_ranges_are_compared_with_the_depth_where_the_log_has_no_altitude(case, 
     assert len(found) == bool(said) and all(said in text for text in found)
 
 
+def test_ranges_that_no_dvl_reaches_are_named_without_altitude_and_depth(case):
+    log, config = dive(case)
+    pings, cells = log[BEAMS], log[BEAMS].data.reshape(-1, 9, 5).copy()
+    cells[:, :4, 2] = 5000.0
+    far = replace(pings, data=cells.reshape(len(pings), -1))
+    (found,) = ranges(replace(log, streams={"imu": log["imu"], "dvl": log["dvl"], BEAMS: far}), config)
+    assert "units: {dvl_beam_range: mm}" in found.text
+
+
 @pytest.mark.parametrize(("use", "missed"), [("auto", False), ("beams", False), ("velocity", True)])
 def test_bottom_lock_is_not_missed_where_beams_carry_the_dive(case, use, missed):
     """The instrument makes no velocity of half of the pings, in which two beams are left."""

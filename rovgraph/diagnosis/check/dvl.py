@@ -26,6 +26,7 @@ from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.water_layer import CELLS, VELOCITIES
 
 LONGEST_LAG_S, LAG_STEP_S, SLOPE_S = 30.0, 0.5, 1.0  # of profiles against the depth, and over which it changes
+FARTHEST_M = 2000.0  # that a DVL of 38 kHz reaches
 CHANGE_S, CHANGE_M, TOGETHER = 5.0, 0.2, 0.7  # over which range and depth change, by how much, and correlation
 BETTER_LAG = 0.6  # of the error as it stands, that another lag or sign leaves
 BESIDE_S = 1.0  # between a profile and a ping
@@ -99,7 +100,7 @@ def ranges(log: Log, config: Config) -> Iterator[Finding]:
     Without altitude, against the depth: over a bottom without steps the one grows as the other shrinks.
     """
     geometry = beam_geometry(config.dvl)
-    if geometry is None or BEAMS not in log or not {"dvl_altitude", "depth"} & log.sensors:
+    if geometry is None or BEAMS not in log:
         return
     beams, cosine = beams_of(log[BEAMS].data, geometry.numbers), abs(float(geometry.directions[:, 2].mean()))
     beside = "dvl_altitude" if "dvl_altitude" in log else "depth"
@@ -108,8 +109,12 @@ def ranges(log: Log, config: Config) -> Iterator[Finding]:
         ("distance", "range", beams.distance, cosine),
     ):
         mean = measured.mean(axis=1)  # of whole pings: in the mean of all beams a slope and a tilt cancel
+        known = mean[np.isfinite(mean)]
         ratio = (_to_altitude if beside == "dvl_altitude" else _to_depth)(log, mean)
         if ratio is None:
+            if len(known) and np.median(known) > FARTHEST_M:
+                text = f"dvl_beam_{name}_K is {np.median(known):.4g} m in the median, farther than a DVL reaches"
+                yield Finding(BEAMS, "warning", f"{text}: if it is in millimetres, state units: {{dvl_beam_range: mm}}")
             continue
         text = f"dvl_beam_{name}_K {'is' if beside == 'dvl_altitude' else 'changes by'} {ratio:.3g} times {beside}"
         right = 1.0 / cosine if name == "range" else 1.0
@@ -134,7 +139,7 @@ def _to_altitude(log: Log, mean: Array) -> float | None:
 def _to_depth(log: Log, mean: Array) -> float | None:
     """Ratio of the changes of the mean range to those of the depth, upwards; None where they do not go together."""
     known = np.isfinite(mean)
-    if np.count_nonzero(known) < ENOUGH or len(log["depth"]) < ENOUGH:
+    if "depth" not in log or min(np.count_nonzero(known), len(log["depth"])) < ENOUGH:
         return None
     time, far = log[BEAMS].time[known], mean[known]
     later = np.searchsorted(time, time + CHANGE_S)
@@ -170,7 +175,7 @@ def profiles(log: Log, config: Config) -> Iterator[Finding]:
     if turned < BETTER_LAG * error[now]:
         remedy = "state units: {adcp_velocity: -m/s}"
         yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
-    elif error[best] < BETTER_LAG * error[now]:
+    elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
         text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
         yield Finding(CELLS, "warning", f"{text}: state delay_s.adcp, or correct them", "lag")
     yield from _unmarked(log, cells, velocity)
