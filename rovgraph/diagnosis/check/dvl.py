@@ -139,7 +139,7 @@ def _to_altitude(log: Log, mean: Array) -> float | None:
 def _to_depth(log: Log, mean: Array) -> float | None:
     """Ratio of the changes of the mean range to those of the depth, upwards; None where they do not go together."""
     known = np.isfinite(mean)
-    if "depth" not in log or min(np.count_nonzero(known), len(log["depth"])) < ENOUGH:
+    if "depth" not in log or min(int(known.sum()), len(log["depth"])) < ENOUGH:
         return None
     time, far = log[BEAMS].time[known], mean[known]
     later = np.searchsorted(time, time + CHANGE_S)
