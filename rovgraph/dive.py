@@ -53,7 +53,7 @@ class DiveEstimates:
     estimates : "smoothed" and "filtered" as requested, and "dead_reckoning"
     initial : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
-    frozen : measurements that are none, such as values that repeat; ignored too
+    frozen : invalid values of a frozen sensor, such as values that repeat; ignored too
     statistics : numbers that healthy dives keep small
     """
 

@@ -23,11 +23,6 @@ def identity(n: int) -> Array:
     return out
 
 
-def identities(count: int, n: int) -> Array:
-    """Unit matrices of n rows, shape (count, n, n)."""
-    return np.zeros((count, 1, 1)) + identity(n)
-
-
 def wrap_angle(angle: ArrayLike) -> Array:
     """Angle wrapped to [-pi, pi) [rad]."""
     return (np.asarray(angle, dtype=float) + np.pi) % (2.0 * np.pi) - np.pi

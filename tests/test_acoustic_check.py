@@ -191,6 +191,15 @@ def test_a_fault_is_named_and_its_remedy_mends_it(dive, fault):
         assert found(dive.read(mended, usbl=replies), mended, checks) == []
 
 
+def test_ranges_in_centimetres_are_named_by_the_depth(dive):
+    replies = altered(dive.streams["usbl"], usbl_range=lambda t: 100.0 * t["usbl_range"])
+    said = found(dive.read(dive.configuration, usbl=replies), dive.configuration, (acoustics.depths,))
+    assert [f.kind for f in said] == ["unit"]
+    mended = followed(dive.configuration, said[0].text)
+    assert mended["units"]["usbl_range"] == "cm"
+    assert found(dive.read(mended, usbl=replies), mended, (acoustics.depths,)) == []
+
+
 def acoustics_own(log: Log, config: Config) -> Iterator[Finding]:
     from rovgraph.diagnosis.check.values import own
 
@@ -344,6 +353,7 @@ def beacons(*names: str) -> dict[str, Any]:
         ({"sound": {"profile": [[0, 1490], [-60, 1500]]}}, "change the sign of its depths, and sort it by them"),
         ({"sound": {"profile": [[0, 1500], [30, 1490], [0, 1500]]}}, "keep one row of each depth"),
         ({"usbl": {"frame": "head"}}, "usbl.frame: expected"),
+        ({"ship": {"north_m": 5.0}}, "ship: expected both north_m and east_m, or neither"),
     ],
 )
 def test_a_configuration_that_cannot_be_is_refused(command, dive, stated, words):
@@ -374,6 +384,7 @@ def degrees(column: str) -> Callable[[Table], Any]:
 @pytest.mark.parametrize(
     ("sensor", "columns", "words"),
     [
+        ("usbl", {"usbl_range": lambda t: 1000.0 * t["usbl_range"]}, "state units: {usbl_range: mm}"),
         ("usbl", {"usbl_beacon": several}, "2 transponders answer (3, 4); state which is the vehicle's"),
         ("usbl", {"usbl_bearing": degrees("usbl_bearing")}, "state units: {usbl_bearing: deg}"),
         ("usbl", {"usbl_elevation": degrees("usbl_elevation")}, "state units: {usbl_elevation: deg}"),
@@ -407,6 +418,13 @@ def test_replies_that_cannot_be_used_are_counted_and_the_others_used(command, di
     code, said = command(dive, merge(dive.configuration, stated), usbl=replies)
     assert code == 0
     assert words in said
+
+
+def test_replies_without_directions_say_what_a_reply_needs(command, dive):
+    ranges = dive.streams["usbl"].drop(columns=["usbl_bearing", "usbl_elevation"])
+    code, said = command(dive, dive.configuration, usbl=ranges)
+    assert code == 0
+    assert "left out, expected usbl_bearing, usbl_elevation and usbl_range or usbl_travel_time" in said
 
 
 def test_ranges_without_beacons_and_to_unknown_ones(command, dive):

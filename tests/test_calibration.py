@@ -9,7 +9,7 @@ import pytest
 from rovgraph.errors import InputError
 from rovgraph.inference.graph.values import key, key_name
 from rovgraph.model.calibration import BEACONS, TABLE
-from rovgraph.model.config import Config, beliefs, parse_config
+from rovgraph.model.config import Config, beliefs, parse_config, with_priors_stated
 from rovgraph.model.state import DIMENSION
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.motion import SCALES
@@ -91,3 +91,19 @@ def test_mean_of_the_mounting_angles_is_the_mounting_unless_it_is_given():
 def test_a_mean_with_the_wrong_number_of_components_names_its_key():
     with pytest.raises(InputError, match=re.escape("own.yaml: calibration.hard_iron.mean: expected one number or thr")):
         parse_config("calibration: {hard_iron: {mean: [0.1, 0.2]}}", "own.yaml")
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "usbl: {frame: ship}",
+        "dvl: {sound_speed_set_mps: 1500, sound_speed_mps: 1480}",
+        "beacons: [{name: a, north_m: 1, east_m: 2, sd_m: 3, down_m: 40, down_sd_m: 0.5}]",
+    ],
+)
+def test_priors_that_follow_from_other_keys_are_those_of_the_effective_configuration(stated):
+    config = parse_config(stated)
+    usual, again = beliefs(Config()), beliefs(parse_config(with_priors_stated(config).to_yaml()))
+    moved = {name: b.sd for name, b in beliefs(config).items() if b.sd != usual[name].sd}
+    assert len(moved) > 0
+    assert {name: again[name].sd for name in moved} == pytest.approx(moved, rel=1e-9)

@@ -368,3 +368,38 @@ def test_axes_and_clock_that_make_beams_agree_with_the_imu_are_named(case):
     turned = changed(config, dvl={"mount_rpy_deg": [0.0, 0.0, 90.0]})
     (found,) = [s for s in smooth(log, turned, "smoothed").statistics if s.kind == "axes"]
     assert found.sensor == "dvl" and "state dvl.mount_rpy_deg" in found.remedy
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, ""), (100.0, "units: {dvl_beam_range: cm}")])
+def test_ranges_are_compared_with_the_depth_where_the_log_has_no_altitude(case, factor, said):
+    """Over a bottom of waves of half a metre, 8 m deep."""
+    log, config = dive(case)
+    pings, cells = log[BEAMS], log[BEAMS].data.reshape(-1, 9, 5).copy()
+    depth = Stream("depth", ("depth",), pings.time, 2.0 + np.sin(0.3 * pings.time)[:, None], pings.row)
+    bottom = 8.0 + 0.25 * np.sin(0.05 * pings.time)[:, None]
+    cells[:, :4, 2] = factor * (bottom - depth.data) / math.cos(np.deg2rad(22.5))
+    streams = {s: x for s, x in log.streams.items() if s != "dvl_altitude"}
+    streams |= {BEAMS: replace(pings, data=cells.reshape(len(pings), -1)), "depth": depth}
+    found = [f.text for f in ranges(replace(log, streams=streams), config)]
+    assert len(found) == bool(said) and all(said in text for text in found)
+
+
+def test_ranges_that_no_dvl_reaches_are_named_without_altitude_and_depth(case):
+    log, config = dive(case)
+    pings, cells = log[BEAMS], log[BEAMS].data.reshape(-1, 9, 5).copy()
+    cells[:, :4, 2] = 5000.0
+    far = replace(pings, data=cells.reshape(len(pings), -1))
+    (found,) = ranges(replace(log, streams={"imu": log["imu"], "dvl": log["dvl"], BEAMS: far}), config)
+    assert "units: {dvl_beam_range: mm}" in found.text
+
+
+@pytest.mark.parametrize(("use", "missed"), [("auto", False), ("beams", False), ("velocity", True)])
+def test_bottom_lock_is_not_missed_where_beams_carry_the_dive(case, use, missed):
+    """The instrument makes no velocity of half of the pings, in which two beams are left."""
+
+    def lose(time: Array, along: Array) -> None:
+        along[::2, 2:] = np.nan
+
+    log, config = dive(case, lose, use=use)
+    said = [f for f in examine(log, config).findings if f.kind == "bottom lock" and f.level == "warning"]
+    assert bool(said) is missed

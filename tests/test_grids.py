@@ -11,7 +11,7 @@ from wire import Heard
 import rovgraph as rg
 from rovgraph.diagnosis.check.fixes import track
 from rovgraph.errors import InputError
-from rovgraph.inference.initialise import with_convergence
+from rovgraph.inference.resolve import convergence
 from rovgraph.live.message import GEODETIC
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.source import Chunk
@@ -109,12 +109,14 @@ def test_a_heading_of_a_grid_is_named_by_its_convergence(
 ) -> None:
     """Headings that are grid ones for added = -1, as the true one is that and the convergence."""
     frame = case.dive.log_frame.copy()
-    convergence, _ = convergence_and_scale(GRID, *np.array(ORIGIN))
-    frame["ahrs_yaw"] += np.deg2rad(added * convergence) + np.deg2rad(case.config.environment.declination_deg)
+    turned, _ = convergence_and_scale(GRID, *np.array(ORIGIN))
+    frame["ahrs_yaw"] += np.deg2rad(added * turned) + np.deg2rad(case.config.environment.declination_deg)
     place = {"origin_lat_deg": ORIGIN[0], "origin_lon_deg": ORIGIN[1], "declination_deg": 0.0, "grid": GRID}
     config = changed(case.config, environment=place, heading={"ahrs_reference": stated}, fix={"sd_m": 0.05})
     log = Log.from_frame(frame, config)
-    found = [finding for finding in track(log, with_convergence(log, config, [])) if "turned by" in finding.text]
+    if (north := convergence(log, config)) is not None:
+        config = config.with_values(environment={"convergence_deg": north})
+    found = [finding for finding in track(log, config) if "turned by" in finding.text]
     assert len(found) == 1
     assert said in found[0].text if said else "convergence" not in found[0].text
     assert found[0].level == ("warning" if said else "ok")

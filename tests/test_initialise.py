@@ -21,7 +21,8 @@ from dives import (
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
-from rovgraph.inference.initialise import UNKNOWN_HEADING_SD, by_accuracy, initialise, sample_density
+from rovgraph.inference.initialise import UNKNOWN_HEADING_SD, by_accuracy, initialise
+from rovgraph.inference.resolve import sample_density
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log
 from rovgraph.model.config import Config, parse_config

@@ -19,6 +19,7 @@ from test_api import command
 
 import rovgraph as rg
 from rovgraph.errors import InputError
+from rovgraph.live.files import RECORDING
 from rovgraph.model.config import completed
 from rovgraph.readers.formats import ReadingOptions, formats
 from rovgraph.readers.merging import Merged, merge
@@ -522,6 +523,12 @@ def test_a_configuration_or_a_results_folder_is_no_log(files, tmp_path):
         rg.read_log(tmp_path / "v.yaml")
     (tmp_path / "summary.json").write_text("{}", encoding="utf-8")
     with pytest.raises(InputError, match="is a results folder; rovgraph evaluate"):
+        rg.read_log(tmp_path)
+    (tmp_path / "trajectory_filtered.csv").write_text("", encoding="utf-8")
+    with pytest.raises(InputError, match=r"evaluate .*trajectory_filtered\.csv"):
+        rg.read_log(tmp_path)
+    (tmp_path / RECORDING).write_text("", encoding="utf-8")
+    with pytest.raises(InputError, match=r"is the folder of a live dive; its log is .*received\.csv"):
         rg.read_log(tmp_path)
     with pytest.raises(InputError, match="no such file; check the name"):
         rg.read_log([files[0], tmp_path / "missing.bin"])

@@ -9,7 +9,7 @@ import pytest
 from dives import batch, changed, exact, falcon, interrupted, simulated, smoothed, started, true_at
 
 import rovgraph as rg
-from rovgraph.geometry import Array, log_rotation, skew, transpose
+from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.inference import posterior
 from rovgraph.inference.estimate import Estimate, state_names
 from rovgraph.inference.graph.places import smooth_graph
@@ -75,23 +75,9 @@ def test_it_has_the_trajectorys_own_covariance_at_a_keyframe_and_its_names(dive)
         assert tuple(P.index) == tuple(P.columns) == state_names("n")
         np.testing.assert_allclose(P.to_numpy()[3:6, 3:6], track.cov_p[k], rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(P.to_numpy()[:3, :3], track.cov_theta[k], rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(P.to_numpy()[6:9, 6:9], track.cov_v[k], rtol=1e-9, atol=1e-15)
     bias_sd = dive.history["gyr_bias"].sd[100]
     np.testing.assert_allclose(np.sqrt(np.diagonal(dive.covariance(track.time[100])))[12:], bias_sd, rtol=1e-9)
-
-
-def test_its_velocity_is_the_tracks_but_for_how_attitude_and_bias_turn_the_velocity_of_the_arm(dive):
-    """`Trajectory.cov_v` leaves these two out; without them both are equal, turning or not."""
-    track, known = dive.trajectory, dive.posterior.optimum
-    arm, turning = np.asarray(dive.posterior.initial.config.imu.lever_arm_m), 0.0
-    for k in (0, 64, 100, len(track) - 1):
-        rate_b, R = known.problem.rate_b[k] - known.state.bias[k, 3:], track.R_nb[k]
-        apart = np.zeros((3, 15))
-        apart[:, 6:9] = np.eye(3)
-        apart[:, :3], apart[:, 12:] = -R @ skew(np.cross(rate_b, arm)), R @ skew(arm)
-        P = dive.covariance(track.time[k]).to_numpy()
-        np.testing.assert_allclose(apart @ P @ apart.T, track.cov_v[k], rtol=1e-9, atol=1e-15)
-        turning = max(turning, np.abs(P[6:9, 6:9] / track.cov_v[k] - 1.0).max())
-    assert turning > 0.1
 
 
 def test_north_and_east_alone_are_those_of_the_whole():

@@ -107,6 +107,19 @@ def test_units_and_the_unit_that_numbers_are_in(unit: str, pascal: float) -> Non
         log_of(pressure / pascal, NORTH)
 
 
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (14.1, r"state units: \{pressure: psi\}, or if it was never at the surface, state units: \{pressure: dbar\}"),
+        (1411.0, r"if these are metres, .*; if it was never at the surface, state units: \{pressure: hPa\}"),
+        (1.41, r"if it was never at the surface, state units: \{pressure: bar\}"),
+    ],
+)
+def test_pressures_of_a_log_that_begins_under_water_may_be_in_another_unit(number: float, said: str) -> None:
+    with pytest.raises(rg.InputError, match=said):
+        log_of(number * np.linspace(1.0, 1.01, len(TIME)), NORTH)
+
+
 def test_psi_taken_for_bar_is_told() -> None:
     _, pressure = dive()
     with pytest.warns(rg.DataWarning, match=r"never at the surface.*the unit is psi: state units: \{pressure: psi\}"):

@@ -395,3 +395,15 @@ def test_a_simulated_dive_has_profiles_that_smoothing_takes(tmp_path):
     assert np.sqrt(np.mean(off**2, axis=0)) == pytest.approx(config.water.cell_sd_mps, rel=0.5)
     with pytest.raises(InputError, match="as \\(4, 25\\)"):
         Choices(profiles=(4, 0))
+
+
+def test_cells_whose_vertical_velocity_is_noise_are_not_called_late():
+    """The depth stands still for a while at the end, where noise is nearest to it."""
+    rng, time = np.random.default_rng(1), np.arange(0.0, 100.0)
+    depth = np.where(time < 70.0, 5.0 + 3.0 * np.sin(0.3 * time), 5.0)
+    log = Log.from_arrays(time=time, depth=depth)
+    three = {name: rng.normal(0.0, 0.01, 2 * len(time)) for name in ("vx", "vy", "vz")}
+    table = {"time": np.repeat(time, 2), "range": np.tile([2.0, 4.0], len(time)), **three}
+    stream = usable_cells(table, parse_config(""), "adcp")
+    found = [*profiles(log.with_profiles(stream), parse_config(""))]
+    assert [f.kind for f in found if f.level == "warning"] == []

@@ -338,4 +338,4 @@ def with_engine(config: Config, engine: str | None) -> Config:
         return config
     if engine not in ENGINES:
         raise InputError(f"engine {engine!r}: expected {', '.join(ENGINES)}")
-    return config.model_copy(update={"graph": config.graph.model_copy(update={"solver": engine})})
+    return config.with_values(graph={"solver": engine})

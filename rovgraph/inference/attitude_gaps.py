@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.inference.initialise import TILT
+from rovgraph.inference.resolve import TILT
 from rovgraph.log import Log
 from rovgraph.model.config import Config
 from rovgraph.problem.motion import LONGEST_CRUISED_S, motion_model

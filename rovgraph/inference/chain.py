@@ -23,7 +23,7 @@ from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
 from rovgraph.kernels.elimination import DiveFactors, eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE, TIME
 from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, WATER_LAYER, Belief, calibration_size
-from rovgraph.model.state import BIAS, POSE, VELOCITY, State
+from rovgraph.model.state import COLUMNS, State
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.layers import OUT_OF_SIGHT, NewKnot, conditional, new_knots, window_changes
@@ -43,7 +43,6 @@ from rovgraph.problem.measurements import (
 from rovgraph.problem.problem import Problem
 
 MOTION = 15  # components of a keyframe before what walks
-COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 NOTHING = np.empty(0, np.int64)
 
 

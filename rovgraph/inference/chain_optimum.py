@@ -13,7 +13,7 @@ import numpy as np
 
 from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.inference import gauss_newton
-from rovgraph.inference.chain import CLONED, COLUMNS, CONDITIONALS, MOTION, NOTHING, Chain, ChainStep
+from rovgraph.inference.chain import CLONED, CONDITIONALS, MOTION, NOTHING, Chain, ChainStep
 from rovgraph.inference.chain_information import MeasurementRows, SquareRoot
 from rovgraph.inference.faulty_intervals import Searches, converged, resume, solve
 from rovgraph.inference.gauss_newton import Gates, GaussNewtonResult, left_after, whole_share
@@ -21,7 +21,7 @@ from rovgraph.inference.optimum import Knowledge
 from rovgraph.inference.widened_chain import widened
 from rovgraph.kernels.chain_posterior import back_substitute
 from rovgraph.model.calibration import Belief
-from rovgraph.model.state import State
+from rovgraph.model.state import COLUMNS, MOTION_STATE, State
 from rovgraph.problem.calibration_roles import CalibrationRoles, unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements, weights_of
@@ -337,7 +337,7 @@ class ChainOptimum:
         """As `rovgraph.inference.optimum.Optimum`."""
         root, P_y = self.eliminated(), self._end.border_covariance(self.believed)
         P = root.covariances(P_y) if len(self.problem) <= SHORT else root.turn_into_covariances(P_y)
-        out = {name: P[:, own, own] for name, own in COLUMNS.items()}
+        out = {name: P[:, own, own] for name, own in COLUMNS.items()} | {MOTION_STATE: P[:, :MOTION, :MOTION]}
         for name, (border, own) in self.wide.layout.places.items():
             out[name] = np.broadcast_to(P_y[own, own], (len(P), *P_y[own, own].shape)) if border else P[:, own, own]
         return out

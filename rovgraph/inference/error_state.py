@@ -23,6 +23,7 @@ from rovgraph.inference.estimate import (
     current_frame,
     reply_frame,
     residual_frame,
+    velocity_covariance,
 )
 from rovgraph.inference.filter import FilterEngine
 from rovgraph.inference.filter_step import (
@@ -39,18 +40,19 @@ from rovgraph.inference.observability import without_what_noise_moves
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.remembered_places import RememberedPlace, columns, common, extended
 from rovgraph.inference.smoother import optimum
+from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.measurement_row import TIME
 from rovgraph.log import Log, Measurement
 from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
-from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
+from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, State
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
 from rovgraph.problem.problem import Problem
 from rovgraph.process import stage
 
-# of some keyframes, their number first in every shape: state, calibration, covariances of pose and velocity, sd of the
-# error
+# of some keyframes, their number first in every shape: state, calibration, covariances of the pose at the IMU and of
+# the origin's velocity, sd of the error
 Columns = tuple[Array, Array, Array, Array, Array]
 
 
@@ -87,27 +89,29 @@ class FilterHistory:
         """Count of keyframes."""
         return self._count
 
-    def append(self, known: Gaussian, met: Met) -> None:
-        """Take the next keyframe."""
+    def append(self, known: Gaussian, met: Met, keyframes: Array) -> None:
+        """Take the next keyframe, of those of the dive."""
         self._count += 1
-        self._pieces.append(self._columns(known))
+        self._pieces.append(self._columns([known], keyframes[self._count - 1 : self._count]))
         if len(met):
             place = met.place if (met.number >= 0).any() else met.place[:0]
             self._met.append(_Part(met.states, met.nis, met.weight, place))
 
-    def extend(self, run: FilterRun) -> None:
-        """Take the intervals that a filter has run through."""
+    def extend(self, run: FilterRun, keyframes: Array) -> None:
+        """Take the intervals that a filter has run through, of the keyframes of the dive."""
         if not len(run):
             return
         filtered = run.filtered
         self._met.append(_Part(run.states, filtered.nis, filtered.weight, np.empty((0, 2))))
+        own = keyframes[self._count : self._count + len(run)]
         self._count += len(run)
-        self._pieces.append((filtered.x, filtered.c, filtered.pose, filtered.velocity, filtered.sd))
+        self._pieces.append(self._reduced(filtered.x, filtered.c, filtered.covariance, filtered.sd, own))
 
-    def replace_last(self, known: Gaussian) -> None:
-        """Take another estimate of the newest keyframe."""
+    def replace_last(self, known: Gaussian, keyframes: Array) -> None:
+        """Take another estimate of the newest keyframe, of those of the dive."""
         x, c, pose, velocity, sd = self._pieces.pop()
-        self._pieces += [(x[:-1], c[:-1], pose[:-1], velocity[:-1], sd[:-1]), self._columns(known)]
+        newest = self._columns([known], keyframes[self._count - 1 : self._count])
+        self._pieces += [(x[:-1], c[:-1], pose[:-1], velocity[:-1], sd[:-1]), newest]
 
     @property
     def states(self) -> State:
@@ -127,13 +131,17 @@ class FilterHistory:
 
     def smoothed(self, problem: Problem, kind: str, known: Sequence[Gaussian]) -> Estimate:
         """The estimate of every keyframe that a smoother has found."""
-        return self._estimate(problem, kind, _joined([self._columns(one) for one in known]), stack_states(known))
+        return self._estimate(problem, kind, self._columns(known, problem.keyframes), stack_states(known))
 
-    def _columns(self, known: Gaussian) -> Columns:
-        """Of one keyframe."""
-        size, columns, P = self._engine.layout.size, self._engine.layout.columns, known.covariance
-        pose, velocity = (P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
-        return known.x[None], known.c[None], pose[None], velocity[None], np.sqrt(np.diagonal(P)[:size])[None]
+    def _columns(self, known: Sequence[Gaussian], keyframes: Array) -> Columns:
+        """Of as many keyframes."""
+        size, P = self._engine.layout.size, [one.covariance for one in known]
+        x, c, sd = np.array([k.x for k in known]), np.array([k.c for k in known]), np.array([*map(np.diagonal, P)])
+        return self._reduced(x, c, np.array([own[:MOTION, :MOTION] for own in P]), np.sqrt(sd[:, :size]), keyframes)
+
+    def _reduced(self, x: Array, c: Array, P: Array, sd: Array, keyframes: Array) -> Columns:
+        """From the covariance of pose, velocity and bias, shape (n, 15, 15)."""
+        return x, c, P[:, :6, :6].copy(), velocity_covariance(keyframes, states_of(x), self._engine.initial, P), sd
 
     def _estimate(self, problem: Problem, kind: str, found: Columns, smoothed: State | None) -> Estimate:
         """An estimate; residuals are those before the measurements entered where nothing was smoothed."""
@@ -336,7 +344,7 @@ class ErrorStateFilter:
             self.departed.append(done.departed)
             self.transitions.append(done.transition)
         self.known = done.filtered
-        self.history.append(self.known, done.met)
+        self.history.append(self.known, done.met, self.problem.keyframes)
         self._reinitialise()
         self.assembly.time_offsets.assume(self.known.c)
         return done
@@ -356,7 +364,7 @@ class ErrorStateFilter:
             if alone and not self.engine.changes_in(problem.time[k - 1], problem.time[end - 1]):
                 run = self.engine.run(problem, k, end, self.known, self.gates)
                 self.known = run.known
-                self.history.extend(run)
+                self.history.extend(run, self.problem.keyframes)
                 k += len(run)
                 self._reinitialise()
             if k < end:
@@ -374,7 +382,7 @@ class ErrorStateFilter:
             self._due.pop(0)
             self.known, best = reinitialised(self.engine, self.problem.upto(n), self.states())
             self._smoothed = best.state
-            self.history.replace_last(self.known)
+            self.history.replace_last(self.known, self.problem.keyframes)
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""

@@ -290,11 +290,10 @@ def body_trajectory(
     states : State of n epochs, at the IMU
     initial : of the dive
     cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
-    cov_velocity : ndarray, shape (n, 3, 3), in n, or None
+    cov_velocity : ndarray, shape (n, 3, 3), of `velocity_covariance`, or None
     """
     R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(initial.config.imu.lever_arm_m)
     time, rate_b = keyframes[:, TIME].copy(), keyframes[:, RATE_B : RATE_B + 3]
-    rate_sd = keyframes[:, SPREAD, None, None]
     p_n = states.p_n - rotate(R, lever_arm_b)
     v_n = states.v_n - rotate(R, cross(rate_b - states.bias[:, 3:], lever_arm_b))
     if cov_pose is None or cov_velocity is None:
@@ -312,8 +311,26 @@ def body_trajectory(
         v_n,
         cov_p=cov_p,
         cov_theta=R @ cov_pose[:, :3, :3] @ transpose(R),
-        cov_v=cov_velocity + rate_sd**2 * arm @ transpose(arm),
+        cov_v=cov_velocity,
     )
+
+
+def velocity_covariance(keyframes: Array, states: State, initial: InitialConditions, P: Array) -> Array:
+    """Covariance of the velocity of the body's origin, in n, shape (n, 3, 3) [m^2/s^2].
+
+    v - R (w - b) x l: attitude turns the velocity of the arm, which the gyro's bias and noise make.
+
+    Parameters
+    ----------
+    keyframes, states, initial : of `body_trajectory`
+    P : ndarray, shape (n, 15, 15), of pose, velocity and bias, in GTSAM's tangent space
+    """
+    R, lever_arm_b = states.R_nb, np.asarray(initial.config.imu.lever_arm_m)
+    arm, rate_b = R @ skew(lever_arm_b), keyframes[:, RATE_B : RATE_B + 3] - states.bias[:, 3:]
+    J = np.zeros((len(P), 3, P.shape[1]))
+    J[..., :3], J[..., 6:9], J[..., 12:15] = R @ skew(cross(rate_b, lever_arm_b)), np.eye(3), -arm
+    rate_sd = keyframes[:, SPREAD, None, None]
+    return np.asarray(J @ P @ transpose(J) + rate_sd**2 * arm @ transpose(arm))
 
 
 def second_order(cov_p_heading: Array) -> Array:

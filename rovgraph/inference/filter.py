@@ -390,7 +390,7 @@ class FilterEngine:
         rows = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
         taken, first = problem.taken[begin:end] - rows.start, problem.first[begin:end] - rows.start
         k, m, C, size = end - begin, rows.stop - rows.start, len(before.c), self.layout.size
-        shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
+        shapes = (k, 21), (k, C), (k, 21), (k, C), (k, MOTION, MOTION), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
         some = slice(begin - 1, end - 1)
         motions, covariances, scales = problem.motions[some], problem.covariances[some], problem.scales[some]

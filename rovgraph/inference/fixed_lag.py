@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.inference.estimate import body_trajectory
+from rovgraph.inference.estimate import body_trajectory, velocity_covariance
 from rovgraph.inference.filter import FilterEngine
 from rovgraph.inference.filter_step import FilterGates, Gaussian, Met, states_of
 from rovgraph.inference.remembered_places import RememberedPlace
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import assembly as at
+from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.motion_row import GAP
 from rovgraph.log import Measurement
-from rovgraph.model.state import POSE, VELOCITY
+from rovgraph.model.state import POSE
 from rovgraph.problem.assembly import InsertResult, assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
 
@@ -214,10 +215,10 @@ class FixedLag:
         ----------
         keyframes, known : ndarray, shape (KEYFRAME,), and what is known, of n of them
         """
-        columns = self.filter.layout.columns
-        pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
-        states = states_of(np.array([k.x for k in known]))
-        return body_trajectory(np.array(keyframes), states, self.initial, pose, velocity)
+        states, of = states_of(np.array([k.x for k in known])), np.array(keyframes)
+        P = np.array([k.covariance[:MOTION, :MOTION] for k in known])
+        velocity = velocity_covariance(of, states, self.initial, P)
+        return body_trajectory(of, states, self.initial, P[:, :6, :6], velocity)
 
     def _go_on(self, until: float) -> None:
         """Take measurements up to a time, from the newest keyframe that still stands."""

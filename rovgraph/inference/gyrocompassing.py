@@ -23,7 +23,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import EARTH_RATE, Array, cross, earth_rate_n, rotate, slerp, turned
 from rovgraph.kernels.motion import LONGEST_BRIDGED_S
-from rovgraph.log import Log, Stream
+from rovgraph.log import Log
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors.instruments import HEADING_STREAMS
@@ -116,8 +116,7 @@ def with_earth_rate(log: Log, config: Config, sources: Collection[str]) -> Confi
     if seconds < ALIGN_S:
         text = f"the gyro shows it in {ALIGN_S:.0f} s without a gap, and the IMU has {seconds:.0f} s"
         raise InputError(f"{without}; {text}")
-    environment = config.environment.model_copy(update={"earth_rotation": True})
-    return config.model_copy(update={"environment": environment})
+    return config.with_values(environment={"earth_rotation": True})
 
 
 def coarse_attitude(log: Log, config: Config) -> Array:
@@ -128,7 +127,8 @@ def coarse_attitude(log: Log, config: Config) -> Array:
     log : with an IMU; its DVL is used if it has one
     config : its mountings, latitude and gravity
     """
-    imu, R_bs = _opening(log["imu"], log["imu"].time[0]), mount_matrix(config.imu.mount_rpy_deg)
+    begin = log["imu"].time[0]
+    imu, R_bs = log["imu"].between(begin, begin + ALIGN_S), mount_matrix(config.imu.mount_rpy_deg)
     time, force, rate = imu.time, imu.data[:, :3] @ R_bs.T, imu.data[:, 3:] @ R_bs.T
     R = turned(time, rate)
     felt = rotate(R, force)
@@ -146,14 +146,10 @@ def coarse_attitude(log: Log, config: Config) -> Array:
     return C
 
 
-def _opening(stream: Stream, begin: float) -> Stream:
-    return stream.take((stream.time >= begin) & (stream.time <= begin + ALIGN_S))
-
-
 def _velocity(log: Log, config: Config, time: Array, rate: Array) -> tuple[Array, Array]:
     """Times, shape (m,), and velocity of the IMU in body axes, shape (m, 3): by the DVL, else none."""
     if "dvl" in log:
-        pings = _opening(log["dvl"], time[0])
+        pings = log["dvl"].between(time[0], time[0] + ALIGN_S)
         slow = (np.abs(pings.data[:, :3]) <= config.dvl.max_speed_mps).all(axis=1)  # false where one is missing
         pings = pings.take(slow & (pings["dvl_valid"] == 1.0))
         if len(pings) > WITHOUT_DVL_HZ * 2:

@@ -77,6 +77,7 @@ class Optimum(Protocol):
     def covariances(self) -> Mapping[str, Array]:
         """Marginal covariances at every keyframe, by state or calibration variable, shape (n, d, d).
 
+        The joint one of pose, velocity and bias is that of `rovgraph.model.state.MOTION_STATE`.
         What is considered has that of its prior. They are large, and calculated each time.
         """
         ...
@@ -84,9 +85,10 @@ class Optimum(Protocol):
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """Joint covariance of the newest keyframe, of the calibration there, and of places.
 
-        Returns ------- ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of
-        `CalibrationRoles`, first what is
-            estimated, then what is considered, then the places in the order of their numbers as given
+        Returns
+        -------
+        ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `CalibrationRoles`, first what
+            is estimated, then what is considered, then the places in the order of their numbers as given
         """
         ...
 

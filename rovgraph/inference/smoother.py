@@ -22,17 +22,18 @@ from rovgraph.inference.estimate import (
     current_frame,
     reply_frame,
     residual_frame,
+    velocity_covariance,
 )
 from rovgraph.inference.faulty_intervals import CLEAR, Searches
 from rovgraph.inference.gauss_newton import rejects
-from rovgraph.inference.initialise import unseen
 from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, without_noise_of_rates
 from rovgraph.inference.observability import shown, shown_below, without_what_noise_moves
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.inference.posterior import Posterior
+from rovgraph.inference.resolve import unseen
 from rovgraph.log import Log
 from rovgraph.model.calibration import WATER_LAYER
-from rovgraph.model.state import BIAS, PLACE, POSE, VELOCITY, State
+from rovgraph.model.state import BIAS, MOTION_STATE, PLACE, POSE, State
 from rovgraph.problem.admission import TimeOffsets
 from rovgraph.problem.assembly import assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -215,7 +216,8 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     best, relative = without_what_noise_moves(best)
     states, problem = best.state, best.problem
     covariances = best.covariances()
-    trajectory = body_trajectory(problem.keyframes, states, b, covariances[POSE], covariances[VELOCITY])
+    velocity = velocity_covariance(problem.keyframes, states, b, covariances[MOTION_STATE])
+    trajectory = body_trajectory(problem.keyframes, states, b, covariances[POSE], velocity)
     bias_sd = np.sqrt(np.diagonal(covariances[BIAS], axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}

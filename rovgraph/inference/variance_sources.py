@@ -14,12 +14,12 @@ A long dive is processed in pieces, since its conditionals and the Jacobians of 
 import numpy as np
 
 from rovgraph.geometry import Array, transpose
-from rovgraph.inference.chain import COLUMNS, MOTION, Chain, ChainStep
+from rovgraph.inference.chain import MOTION, Chain, ChainStep
 from rovgraph.inference.chain_information import SquareRoot, solve_upper
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.kernels import chain_posterior
 from rovgraph.model.calibration import TABLE
-from rovgraph.model.state import State
+from rovgraph.model.state import COLUMNS, State
 from rovgraph.problem.measurements import Measurements, pieces
 from rovgraph.process import stage
 

@@ -25,7 +25,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matrix, Vector, helper, kernel, view_helper
 from rovgraph.kernels.correction import Corrected, GivenRows, correct
 from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.layout import ACC_SCALE, MOTION, VELOCITY
+from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.measurement_row import KIND, PRELINEARISED, MeasuredRows, some_of
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
@@ -176,13 +176,13 @@ def _copy(v: Array, v_out: Array) -> None:
 
 
 @view_helper
-def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
-    """P + B B' of the components from ``first`` on."""
+def _covariance(P: Array, B: Array, P_out: Array) -> None:
+    """P + B B' of the first components."""
     for i in range(len(P_out)):
         for j in range(len(P_out)):
-            total = P[first + i, first + j]
+            total = P[i, j]
             for k in range(B.shape[1]):
-                total += B[first + i, k] * B[first + j, k]
+                total += B[i, k] * B[j, k]
             P_out[i, j] = total
 
 
@@ -295,7 +295,7 @@ class Filtered(NamedTuple):
     ----------
     x, c : shapes (k, 21), (k, C), the keyframes
     predicted_x, predicted_c : the same before what was measured at them
-    pose, velocity, sd : shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
+    covariance, sd : shapes (k, 15, 15), (k, size), of pose, velocity and bias, and of all of the error
     nis, weight : shape (m,), of the measurements
     """
 
@@ -303,8 +303,7 @@ class Filtered(NamedTuple):
     c: Matrix
     predicted_x: Matrix
     predicted_c: Matrix
-    pose: Matrices
-    velocity: Matrices
+    covariance: Matrices
     sd: Matrix
     nis: Vector
     weight: Vector
@@ -351,8 +350,7 @@ def filter_intervals(
         take_interval(known, interval, model, since, True, taken_out)
         _copy(x, out.x[k])
         _copy(c, out.c[k])
-        _covariance(P, B, 0, out.pose[k])
-        _covariance(P, B, VELOCITY, out.velocity[k])
+        _covariance(P, B, out.covariance[k])
         for i in range(size):
             variance = P[i, i]
             for j in range(len(L)):

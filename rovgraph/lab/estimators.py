@@ -242,18 +242,17 @@ def with_headings(log: Log, config: Config, letter: str) -> Config:
     if letter in "ab" and "dvl_heading" not in log:
         raise InputError(f"{log.source}: no compass of the DVL (dvl_heading)")
     sources = {"a": (magnetometer, compass), "b": (compass,), "c": (magnetometer,)}[letter]
-    return config.model_copy(update={"heading": config.heading.model_copy(update={"sources": sources})})
+    return config.with_values(heading={"sources": sources})
 
 
 def with_misalignment(config: Config, estimate: bool) -> Config:
     """A configuration that estimates the DVL's yaw, or holds it at its mean."""
-    entry = config.calibration.dvl_yaw.model_copy(update={"estimate": estimate})  # type: ignore[attr-defined]
-    return config.model_copy(update={"calibration": config.calibration.model_copy(update={"dvl_yaw": entry})})
+    return config.with_values(calibration={"dvl_yaw": {"estimate": estimate}})
 
 
 def with_hydrodynamics(config: Config) -> Config:
     """A configuration that uses thrusters and drag."""
-    return config.model_copy(update={"graph": config.graph.model_copy(update={"hydrodynamics": True})})
+    return config.with_values(graph={"hydrodynamics": True})
 
 
 def assembled(task: ChainTask) -> BatchSmoother:

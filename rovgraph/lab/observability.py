@@ -169,8 +169,7 @@ def estimating(config: Config, also: Sequence[str]) -> Config:
             near = difflib.get_close_matches(name, TABLE, 1)
             hint = f", did you mean {near[0]}?" if near else ""
             raise InputError(f"unknown calibration variable {name!r}{hint} (known: {', '.join(TABLE)})")
-    entries = {name: getattr(config.calibration, name).model_copy(update={"estimate": True}) for name in also}
-    return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
+    return config.with_values(calibration={name: {"estimate": True} for name in also})
 
 
 def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimum:

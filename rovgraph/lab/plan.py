@@ -310,9 +310,9 @@ def _above_beacons(path: Path, config: Config) -> tuple[Path, Config]:
         placed.append(beacon.model_copy(update={**known, "down_m": depth, "down_sd_m": down.sd}))
     first = placed[0]
     above = np.array([first.north_m, first.east_m, max(float(first.down_m or 0.0) - ABOVE_BEACON_M, 1.0)])
-    first_place = config.start.model_copy(update={"north_m": float(above[0]), "east_m": float(above[1])})
+    first_place = {"north_m": float(above[0]), "east_m": float(above[1])}
     shifted = path.shifted(above - [*np.zeros(2), start[2]])
-    return shifted, config.model_copy(update={"beacons": tuple(placed), "start": first_place})
+    return shifted, config.with_values(beacons=tuple(placed), start=first_place)
 
 
 def _with(already: Array, seen: Observability, manoeuvre: Manoeuvre) -> Prediction:

@@ -17,7 +17,8 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
-from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
+from rovgraph.inference.initialise import WINDOW_S, initialise
+from rovgraph.inference.resolve import WITHIN_S
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
@@ -332,7 +333,7 @@ class Startup:
             self.waits_for = NEEDS_ORIGIN
             return None
         if origin is None:
-            config = config.model_copy(update={"environment": config.environment.model_copy(update={"frame": "flat"})})
+            config = config.with_values(environment={"frame": "flat"})
         try:
             initial = initialise(log, config, expected)
         except InputError as error:

@@ -153,7 +153,7 @@ def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
                     raise ValueError
                 marks.append(mark)
             except (ValueError, TypeError, KeyError):
-                warnings.complain(str(path), "marks", "a line that is no mark is left out")
+                warnings.complain(str(path), "marks", "an invalid line is left out")
     return tuple(marks)
 
 

@@ -83,11 +83,10 @@ class Navigator:
     update_s: float = 0.0
 
     def __post_init__(self) -> None:
-        imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
         self.faults = Faults(self.config)
         self._crosscheck = Crosscheck(self.config)
-        self._startup = Startup(self.config.model_copy(update={"imu": imu}))
+        self._startup = Startup(self.config.with_values(imu={"max_gap_s": NO_GAP_IS_TOO_LONG_S}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()

@@ -18,7 +18,6 @@ from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.diagnosis.unstated_noise import unstated
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.inference.chain import COLUMNS
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.error_state import REINITIALISE_AT_S, reinitialised
 from rovgraph.inference.filter import FilterEngine
@@ -27,7 +26,7 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.score_test import as_chain
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.model.state import BIAS, VELOCITY
+from rovgraph.model.state import BIAS, COLUMNS, VELOCITY
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.problem import Problem
 from rovgraph.rules import RULES

@@ -159,7 +159,7 @@ class Faults:
         self._yaw_axis = mount_matrix(self.config.imu.mount_rpy_deg)[2]
 
     def look(self, m: Measurement) -> Screening:
-        """Whether a measurement is one; the beams of an invalid ping are none."""
+        """Whether a measurement is valid; the beams of an invalid ping are not."""
         if m.sensor == BEAMS and m.time == self._invalid_ping:
             return Screening(False, count=0)
         verdict = self._look(m)

@@ -417,7 +417,7 @@ PLACES = "fix", "ship"  # that may come in latitude and longitude
 
 
 def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
-    """Leave out latitudes and longitudes that are none, and those beside which there are north and east.
+    """Leave out invalid latitudes and longitudes, and those beside which there are north and east.
 
     Raises
     ------
@@ -515,16 +515,15 @@ def _select(
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
     if partly.any():
-        expected = ", ".join(required) or "all columns of one of its forms"
-        warn(
-            f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected {expected} together; first "
-            f"in line {line[np.argmax(partly)]}"
-        )
+        expected = f"{', '.join(required)} together" if required else SENSORS[sensor].together
+        first = line[np.argmax(partly)]
+        left = f"{partly.sum()} rows partly empty and left out"
+        warn(f"{source}: {sensor}: {left}, expected {expected}; first in line {first}")
     return data, complete
 
 
 def _mend_columns(columns: Sequence[Column], data: Array, line: Lines, source: str) -> None:
-    """Sds that are none become NaN.
+    """Invalid sds become NaN.
 
     Raises
     ------

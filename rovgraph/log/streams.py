@@ -128,6 +128,10 @@ class Stream:
         """Some of its measurements, by index or by mask."""
         return replace(self, time=self.time[index], data=self.data[index], row=self.row[index])
 
+    def between(self, begin: float, end: float) -> "Stream":
+        """Its measurements between two times, these included [s]."""
+        return self.take((self.time >= begin) & (self.time <= end))
+
 
 def integral(time: Array, values: Array, longest: float = np.inf) -> Array:
     """Trapezoidal integral of values over their times from the first on, all shape (n,); gaps count as ``longest``."""

@@ -18,12 +18,16 @@ it is. They have a second, wider sd, for a compass without a stated calibration 
 the two holds depends on the log (`rovgraph.inference.assumptions`), unless the configuration states one.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from rovgraph.geometry import Array
+
+Follows = Callable[[Any, Any], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class Variable:
         infinite = no such error
     unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, without a stated
         calibration or a second sensor [unit]; None = not for this variable
+    follows : what the rest of a `Config` says of its prior, as fields of `Belief`; of the configuration and of its
+        entry in ``calibration``, if it has one
     """
 
     name: str
@@ -63,6 +69,7 @@ class Variable:
     considered: bool = False
     time_constant: float = np.inf
     unchecked_sd: float | None = None
+    follows: Follows | None = field(default=None, repr=False, compare=False)
 
     @property
     def dim(self) -> int:
@@ -153,6 +160,31 @@ def _time_offset(
     return Variable(prefix + _TIME_OFFSET, letter, _ONE, "s", sd, sensors, about, excited_by)
 
 
+KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
+ALIGNED = 1.0 / 3.0  # of a mounting's sd, where the replies are in the ship's axes or north-aligned
+
+
+def _mounted(section: str, axis: int, config: Any, entry: Any) -> dict[str, Any]:
+    """The angle of a mounting, where no other mean is stated."""
+    return {} if entry.mean_deg is not None else {"mean": _DEG * getattr(config, section).mount_rpy_deg[axis]}
+
+
+def _acoustic_head(axis: int, config: Any, entry: Any) -> dict[str, Any]:
+    """The same; a system that states its replies in other axes than the head's has applied its alignment."""
+    aligned = config.usbl.frame != "transducer" and "sd_deg" not in entry.model_fields_set
+    return _mounted("usbl", axis, config, entry) | ({"sd": ALIGNED * (_DEG * entry.sd_deg)} if aligned else {})
+
+
+def _sound(config: Any, entry: Any) -> dict[str, Any]:
+    """A scale that is known as well as the sound in the water."""
+    return {"sd": KNOWN_SOUND_SD} if config.knows_sound_speed and "sd" not in entry.model_fields_set else {}
+
+
+def _of_ranges(one_way: bool, config: Any, entry: Any) -> dict[str, Any]:
+    """Nothing shows what ranges do not have, which are measured one way, or both."""
+    return {} if config.range.one_way == one_way else {"streams": ()}
+
+
 ACOUSTICS = "usbl", "range"  # log streams
 BEACONS = 8  # that a dive may have
 _CONTROL = "".join(
@@ -168,19 +200,59 @@ def beacon_names(k: int) -> tuple[str, str]:
     return f"beacon_{k + 1}", f"beacon_{k + 1}_down"
 
 
+def _place_of_beacon(k: int, config: Any, entry: Any) -> dict[str, Any]:
+    """That which ``beacons`` states, and the streams that show it."""
+    if k >= len(config.beacons):
+        return {"streams": ()}
+    beacon, shown = config.beacons[k], {"streams": ACOUSTICS if config.usbl.head == "vehicle" else ("range",)}
+    if beacon.north_m is None or beacon.east_m is None:
+        return shown
+    return shown | {"mean": np.array([beacon.north_m, beacon.east_m]), "sd": beacon.sd_m}
+
+
+def _depth_of_beacon(k: int, config: Any, entry: Any) -> dict[str, Any]:
+    """The same; directions from the vehicle show the depth as well as the place."""
+    in_plan = getattr(config.calibration, beacon_names(k)[0])
+    place = {"sd": in_plan.sd, **_place_of_beacon(k, config, in_plan)}
+    shown = {"streams": place["streams"]}
+    if not place["streams"]:
+        return shown
+    if config.beacons[k].down_m is not None:
+        return shown | {"mean": config.beacons[k].down_m, "sd": config.beacons[k].down_sd_m}
+    return shown | ({"sd": place["sd"]} if config.usbl.head == "vehicle" else {})
+
+
 def _beacon(k: int) -> tuple[Variable, Variable]:
-    """North and east of an acoustic beacon, and its depth; `Config.beacons` states their priors."""
+    """North and east of an acoustic beacon, and its depth."""
     shown = "a path about it, with turns; ranges alone leave a mirrored place on a straight leg"
     about = f"beacon {k + 1} of beacons"
     names = beacon_names(k)
     place = names[0], _MARKS[2 * k], ("_north", "_east"), "m", 1000.0, ACOUSTICS
     down = names[1], _MARKS[2 * k + 1], _ONE, "m", 10.0, ACOUSTICS
     return (
-        Variable(*place, f"place of {about}, north and east", shown, estimate=True),
         Variable(
-            *down, f"depth of {about}", "passing near it; the depth that a chart or a sounder shows", estimate=True
+            *place, f"place of {about}, north and east", shown, estimate=True, follows=partial(_place_of_beacon, k)
+        ),
+        Variable(
+            *down,
+            f"depth of {about}",
+            "passing near it; the depth that a chart or a sounder shows",
+            estimate=True,
+            follows=partial(_depth_of_beacon, k),
         ),
     )
+
+
+def _current(config: Any, entry: Any) -> dict[str, Any]:
+    """One for all depths is shown by profiles of the water, too."""
+    return {"streams": ("thruster", "dvl_water", WATER_LAYER)} if config.water.knots == 1 else {}
+
+
+def _knot(k: int, config: Any, entry: Any) -> dict[str, Any]:
+    """A knot of the current, of those that are kept."""
+    water, knots = config.water, config.water.knots or len(LAYERS)
+    unused = {} if knots > 1 and k < knots else {"streams": ()}
+    return {"sd": water.current_sd_mps, "walk": water.walk_mps, **unused}
 
 
 STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
@@ -200,6 +272,7 @@ TABLE: dict[str, Variable] = {
             "roll of the DVL's mounting",
             "moving sideways and up and down, with a depth sensor",
             considered=True,
+            follows=partial(_mounted, "dvl", 0),
         ),
         Variable(
             "dvl_pitch",
@@ -211,6 +284,7 @@ TABLE: dict[str, Variable] = {
             "pitch of the DVL's mounting",
             "moving forwards and up and down, with a depth sensor",
             considered=True,
+            follows=partial(_mounted, "dvl", 1),
         ),
         Variable(
             "dvl_yaw",
@@ -222,6 +296,7 @@ TABLE: dict[str, Variable] = {
             "yaw of the DVL's mounting: misalignment",
             "starts, stops and turns, against the accelerometer; position fixes beside a compass that is known",
             considered=True,
+            follows=partial(_mounted, "dvl", 2),
         ),
         Variable(
             "dvl_scale",
@@ -233,6 +308,7 @@ TABLE: dict[str, Variable] = {
             "scale error of the DVL (sound speed)",
             "position fixes far apart; large changes of depth; starts and stops, against the accelerometer",
             considered=True,
+            follows=_sound,
         ),
         Variable(
             "dvl_lever_arm",
@@ -396,6 +472,7 @@ TABLE: dict[str, Variable] = {
             "bottom track beside water track or thrusters; with thrusters, turning",
             estimate=True,
             walk=5e-4,  # a centimetre a second in seven minutes: none stays as it is to the millimetre
+            follows=_current,
         ),
         Variable(
             "fix_error",
@@ -468,17 +545,20 @@ TABLE: dict[str, Variable] = {
                 f"{name} of the acoustic head's axes in the frame that it states{more}",
                 shown,
                 estimate=True,
+                follows=partial(_acoustic_head, axis),
             )
-            for name, letter, sd, more, shown in (
-                ("roll", '"', 1.0, "", "depths from a pressure sensor, with the vehicle to port and to starboard"),
-                ("pitch", "'", 1.0, "", "depths from a pressure sensor, with the vehicle ahead and astern"),
+            for axis, (name, letter, sd, more, shown) in enumerate(
                 (
-                    "yaw",
-                    "=",
-                    3.0,
-                    ", and the ship's compass with it",
-                    "a track beside the ship that a compass or position fixes orient; far from below it",
-                ),
+                    ("roll", '"', 1.0, "", "depths from a pressure sensor, with the vehicle to port and to starboard"),
+                    ("pitch", "'", 1.0, "", "depths from a pressure sensor, with the vehicle ahead and astern"),
+                    (
+                        "yaw",
+                        "=",
+                        3.0,
+                        ", and the ship's compass with it",
+                        "a track beside the ship that a compass or position fixes orient; far from below it",
+                    ),
+                )
             )
         ),
         Variable(
@@ -554,6 +634,7 @@ TABLE: dict[str, Variable] = {
             "offset of ranges to beacons (turn-around time: 1 ms both ways is 0.75 m)",
             "ranges of different lengths",
             considered=True,
+            follows=partial(_of_ranges, False),
         ),
         Variable(
             "range_clock",
@@ -565,6 +646,7 @@ TABLE: dict[str, Variable] = {
             "offset of the clocks of one-way ranges, as a length",
             "several beacons, or a path about one whose place is known",
             estimate=True,
+            follows=partial(_of_ranges, True),
         ),
         Variable(
             "range_clock_drift",
@@ -576,6 +658,7 @@ TABLE: dict[str, Variable] = {
             "drift of the clocks of one-way ranges, as a speed",
             "a dive of an hour with several beacons",
             estimate=True,
+            follows=partial(_of_ranges, True),
         ),
         Variable(
             "range_error",
@@ -640,6 +723,7 @@ TABLE: dict[str, Variable] = {
                 "bottom track or position fixes beside a profile of the water, and profiles that overlap",
                 estimate=True,
                 walk=5e-4,
+                follows=partial(_knot, k),
             )
             for k, name in enumerate(LAYERS)
         ),

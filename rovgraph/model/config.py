@@ -17,7 +17,6 @@ widest offset is 250 sqrt(Hz) d.
 import io
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_origin
 
@@ -32,7 +31,6 @@ from rovgraph import compatibility
 from rovgraph.errors import InputError, as_path, kind_of, warn
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.model.calibration import (
-    ACOUSTICS,
     AUTO,
     BEACONS,
     CONSIDERED,
@@ -40,10 +38,8 @@ from rovgraph.model.calibration import (
     MOUNT,
     TABLE,
     USBL_MOUNT,
-    WATER_LAYER,
     Belief,
     Variable,
-    beacon_names,
 )
 from rovgraph.model.config_errors import complaint, count
 from rovgraph.model.config_sections import (
@@ -89,7 +85,6 @@ from rovgraph.model.gauss_markov import stationary_walk
 from rovgraph.model.origin import Frame, outgrows_plane
 from rovgraph.model.presets import with_presets, without_presets
 
-ALIGNED = 1.0 / 3.0  # of a mounting's sd, where the replies are in the ship's axes or north-aligned
 SHARPEST = 1.0 / np.sqrt(600.0)  # of the prior over the density [sqrt(Hz)]
 WIDEST = 1000.0  # a fibre-optic gyro beside the bias of a MEMS gyro has 3000
 
@@ -414,12 +409,11 @@ class Config(ConfigSection):
 
     def with_raw_magnetometer(self) -> "Config":
         """The same without a calibration of the magnetometer: its samples are what they are."""
-        return self.model_copy(update={"imu": self.imu.model_copy(update={"mag": Mag()})})
+        return self.with_values(imu={"mag": Mag()})
 
     def as_recorded(self) -> "Config":
         """The same for a log whose samples and stamps are taken as they are: without delays and speed of sound, too."""
-        dvl = self.dvl.model_copy(update={"sound_speed_set_mps": None})
-        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}, "dvl": dvl})
+        return self.with_raw_magnetometer().with_values(delay_s={}, dvl={"sound_speed_set_mps": None})
 
     @property
     def knows_sound_speed(self) -> bool:
@@ -465,75 +459,36 @@ def mount_matrix(rpy_deg: Triple) -> Array:
 def beliefs(config: Config) -> dict[str, Belief]:
     """The prior of every calibration variable, in the order of the table.
 
-    Where the configuration gives no mean, that of a mounting's angles is the mounting, and of a beacon its place.
+    An entry of ``calibration`` states it, and what `Variable.follows` from the rest of the configuration.
     """
-    mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
-    mount |= dict(zip(USBL_MOUNT, config.usbl.mount_rpy_deg, strict=True))
     out = {}
-    for name, variable in ((n, v) for n, v in TABLE.items() if n not in LAYERS):
-        entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
-        unit = float(np.deg2rad(1.0)) if variable.angular else 1.0
-        mean = getattr(entry, "mean" + tail)
-        mean = mount.get(name, 0.0) if mean is None else mean
-        values = np.atleast_1d(np.asarray(mean, dtype=float))
-        stated, walk = getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
-        sd = unit * stated if stated is not None and not _sd_follows(name, config) else _usual_sd(name, config)
-        lasts = entry.time_constant_s
+    for name, variable in TABLE.items():
+        entry, tail, unit = getattr(config.calibration, name, None), "", 1.0
+        if variable.angular:
+            tail, unit = "_deg", float(np.deg2rad(1.0))
+        stated: dict[str, Any] = {"estimate": variable.estimate, "walk": variable.walk, "sd": variable.sd, "mean": 0.0}
+        if entry is not None:
+            mean, sd = getattr(entry, "mean" + tail), getattr(entry, "sd" + tail)
+            stated |= {"estimate": entry.estimate, "walk": unit * getattr(entry, "walk" + tail)}
+            stated |= {} if mean is None else {"mean": unit * np.atleast_1d(np.asarray(mean, dtype=float))}
+            stated |= {} if sd is None else {"sd": unit * sd}
+        stated |= {} if variable.follows is None else variable.follows(config, entry)
+        lasts, done = None if entry is None else entry.time_constant_s, stated["estimate"]
         out[name] = Belief(
             variable,
-            unit * np.broadcast_to(values, (variable.dim,)),
-            sd,
-            entry.estimate is True,
-            walk if lasts is None else stationary_walk(sd, lasts),
-            entry.estimate == CONSIDERED,
+            np.array(np.broadcast_to(stated["mean"], (variable.dim,)), dtype=float),
+            stated["sd"],
+            done is True,
+            stated["walk"] if lasts is None else stationary_walk(stated["sd"], lasts),
+            done == CONSIDERED,
             np.inf if lasts is None else lasts,
+            streams=stated.get("streams"),
         )
-    if config.usbl.frame != "transducer":  # the system has applied its alignment
-        for name in USBL_MOUNT:
-            if "sd_deg" not in getattr(config.calibration, name).model_fields_set:
-                out[name] = replace(out[name], sd=ALIGNED * out[name].sd)
-    shown = ACOUSTICS if config.usbl.head == "vehicle" else ("range",)
-    unused = ("range_offset",) if config.range.one_way else ("range_clock", "range_clock_drift")
-    for name in (*unused, *(v for k in range(len(config.beacons), BEACONS) for v in beacon_names(k))):
-        out[name] = replace(out[name], streams=())
-    out |= _of_water(config, out["current"])
-    for k, beacon in enumerate(config.beacons):
-        place, down = beacon_names(k)
-        out[place], out[down] = replace(out[place], streams=shown), replace(out[down], streams=shown)
-        if beacon.north_m is not None and beacon.east_m is not None:
-            out[place] = replace(out[place], mean=np.array([beacon.north_m, beacon.east_m]), sd=beacon.sd_m)
-        if beacon.down_m is not None:
-            out[down] = replace(out[down], mean=np.array([beacon.down_m]), sd=beacon.down_sd_m)
-        elif config.usbl.head == "vehicle":  # whose directions show it
-            out[down] = replace(out[down], sd=out[place].sd)
     return out
 
 
-KNOWN_SOUND_SD = 0.003  # scale error of a DVL whose speed of sound follows from temperature and salinity
-
-
-def _of_water(config: Config, current: Belief) -> dict[str, Belief]:
-    """Priors of the current: one for all depths, or at knots."""
-    water, knots = config.water, config.water.knots or len(LAYERS)
-    at_knots = (TABLE[name] for name in LAYERS)
-    out = {v.name: Belief(v, np.zeros(v.dim), water.current_sd_mps, True, water.walk_mps) for v in at_knots}
-    if knots == 1:
-        out["current"] = replace(current, streams=(*TABLE["current"].sensors, WATER_LAYER))
-    return out | {name: replace(out[name], streams=()) for name in LAYERS[knots if knots > 1 else 0 :]}
-
-
-def _sd_follows(name: str, config: Config) -> bool:
-    """Whether the sd of a prior is not stated and follows from what is known of the sound in the water."""
-    scale = config.calibration.dvl_scale  # type: ignore[attr-defined]
-    return name == "dvl_scale" and config.knows_sound_speed and "sd" not in scale.model_fields_set
-
-
-def _usual_sd(name: str, config: Config) -> float:
-    return KNOWN_SOUND_SD if _sd_follows(name, config) else TABLE[name].sd
-
-
 def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
-    """The configuration with the sds of priors that it leaves to the log.
+    """The configuration with the sds of priors that it leaves to the log or to other keys.
 
     Parameters
     ----------
@@ -541,15 +496,17 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     unchecked : calibration variables of a compass without stated calibration that no sensor checks
     names : calibration variables that are stated; None = all
     """
-    given, entries = config.calibration, {}
-    for name in (name for name in TABLE if name not in LAYERS) if names is None else names:
-        variable, entry = TABLE[name], getattr(given, name)
-        key = "sd_deg" if variable.angular else "sd"
-        if getattr(entry, key) is None or _sd_follows(name, config):
-            sd = (name in unchecked and variable.unchecked_sd) or _usual_sd(name, config)
-            sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
-            entries[name] = entry.model_copy(update={key: sd})
-    return config.model_copy(update={"calibration": given.model_copy(update=entries)})
+    entries = {}
+    for name, belief in beliefs(config).items():
+        variable, entry = belief.variable, getattr(config.calibration, name, None)
+        if entry is None or (names is not None and name not in names):
+            continue
+        key, unit = ("sd_deg", float(np.deg2rad(1.0))) if variable.angular else ("sd", 1.0)
+        stated = getattr(entry, key)
+        if stated is None or unit * stated != belief.sd:
+            sd = (name in unchecked and variable.unchecked_sd) or belief.sd
+            entries[name] = {key: round(float(np.rad2deg(sd)), 12) if variable.angular else sd}
+    return config.with_values(calibration=entries)
 
 
 def load_config(path: Path | str | None = None) -> Config:

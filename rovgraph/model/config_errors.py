@@ -44,14 +44,7 @@ def complaint(error: Any, model: type[BaseModel]) -> str:
         location = location[: -1 if kind == "invalid_key" else -2]
         allowed = f"one of {error['ctx']['expected']}" if kind == "literal_error" else "text"
         return f"{_key(location)}expected {allowed} as a key, found {_shown(error['input'])}"
-    found = _shown(error["input"])
-    if kind == "missing":
-        if isinstance(location[-1], int):  # an item of a list that is too short
-            location, found = location[:-1], count(len(error["input"]))
-        else:
-            found = "nothing"
-    elif kind == "too_long":
-        found = count(error["ctx"]["actual_length"])
+    location, found = _found(error, location)
     if kind in BOUNDS:
         name, text = BOUNDS[kind]
         what = "expected " + text.format(error["ctx"][name])
@@ -63,7 +56,19 @@ def complaint(error: Any, model: type[BaseModel]) -> str:
         what = f"expected {_expected(_kind(model, location))}"
     else:
         what = f"{error['msg'][0].lower()}{error['msg'][1:]}"
-    return f"{_key(location)}{what}, found {found}"
+        found = "" if isinstance(error["input"], dict) else found  # of a section, whose keys the message names
+    return f"{_key(location)}{what}" + (f", found {found}" if found else "")
+
+
+def _found(error: Any, location: tuple[int | str, ...]) -> tuple[tuple[int | str, ...], str]:
+    """Where an error stands, and what was found there."""
+    if error["type"] == "missing" and isinstance(location[-1], int):  # an item of a list that is too short
+        return location[:-1], count(len(error["input"]))
+    if error["type"] == "missing":
+        return location, "nothing"
+    if error["type"] == "too_long":
+        return location, count(error["ctx"]["actual_length"])
+    return location, _shown(error["input"])
 
 
 def _key(location: tuple[int | str, ...]) -> str:

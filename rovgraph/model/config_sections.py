@@ -1,8 +1,9 @@
 """The sections of the configuration, with the keys and limits of each."""
 
 import datetime as dt
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,6 +52,29 @@ DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 class ConfigSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
+    def with_values(self, **values: Any) -> Self:
+        """The same with other values, which are not checked; of a section a mapping of the keys that change."""
+        inside = {key: getattr(self, key) for key in values}
+        return self.model_copy(
+            update={
+                key: section.with_values(**values[key])
+                if isinstance(section, ConfigSection) and isinstance(values[key], Mapping)
+                else values[key]
+                for key, section in inside.items()
+            }
+        )
+
+
+Section = TypeVar("Section", bound=ConfigSection)
+
+
+def _with_both(section: Section, one: str, other: str) -> Section:
+    """Refuses a section that states one of two keys alone."""
+    if (getattr(section, one) is None) != (getattr(section, other) is None):
+        text = "expected both {one} and {other}, or neither"
+        raise PydanticCustomError("half", text, {"one": one, "other": other})
+    return section
+
 
 class StartSettings(ConfigSection):
     """Where the dive starts; null = from the log."""
@@ -77,7 +101,7 @@ class StartSettings(ConfigSection):
 class Environment(ConfigSection):
     """Gravity, magnetic field and Earth rate."""
 
-    gravity_mps2: Positive | None = Field(
+    gravity_mps2: Annotated[float, Field(ge=9.7, le=9.9)] | None = Field(
         None, description="gravity; null = normal gravity of the latitude and depth, 9.81 without a latitude"
     )
     origin_lat_deg: Latitude | None = Field(
@@ -120,9 +144,7 @@ class Environment(ConfigSection):
 
     @model_validator(mode="after")
     def _whole_origin(self) -> Self:
-        if (self.origin_lat_deg is None) != (self.origin_lon_deg is None):
-            raise PydanticCustomError("half", "expected both origin_lat_deg and origin_lon_deg, or neither")
-        return self
+        return _with_both(self, "origin_lat_deg", "origin_lon_deg")
 
     @model_validator(mode="after")
     def _whole_earth(self) -> Self:
@@ -446,6 +468,10 @@ class ShipSettings(ConfigSection):
         default_factory=dict, description="name of a receiver of ranges: its position in ship axes, from the waterline"
     )
 
+    @model_validator(mode="after")
+    def _whole_place(self) -> Self:
+        return _with_both(self, "north_m", "east_m")
+
 
 class AcousticSettings(ConfigSection):
     """Keys that directions and ranges share."""
@@ -519,9 +545,7 @@ class Beacon(ConfigSection):
 
     @model_validator(mode="after")
     def _whole_place(self) -> Self:
-        if (self.north_m is None) != (self.east_m is None):
-            raise PydanticCustomError("half", "expected both north_m and east_m, or neither")
-        return self
+        return _with_both(self, "north_m", "east_m")
 
     @property
     def has_place(self) -> bool:

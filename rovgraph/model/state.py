@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array, exp_rotation, rotate
 
 POSE, VELOCITY, BIAS = "pose", "velocity", "bias"
+MOTION_STATE = "motion"  # the three in this order, 15 components
+COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}  # of it
 DIMENSION = {POSE: 6, VELOCITY: 3, BIAS: 6}
 PLACE, PLACE_DIM = "place", 2  # where a place that is recognised lies, north and east: no part of a keyframe
 

@@ -89,8 +89,7 @@ def with_knots(config: Config, streams: Mapping[str, Stream], whole: bool = True
     reach = float(np.nanmax(far, initial=0.0))
     spacing = max(config.water.knot_m, reach / (len(LAYERS) - 2))
     knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS)) if whole else len(LAYERS)
-    water = config.water.model_copy(update={"knots": max(knots, 2), "knot_m": spacing})
-    return config.model_copy(update={"water": water})
+    return config.with_values(water={"knots": max(knots, 2), "knot_m": spacing})
 
 
 class Cells(NamedTuple):

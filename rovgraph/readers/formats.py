@@ -227,6 +227,9 @@ BEGINNINGS = {  # formats that are known by name and not read
 FOXGLOVE = (b'"topic"', b'"message"', b'"receiveTime"')  # of a message exported as JSON
 
 
+LIVE_RECORDING = "received.csv"
+
+
 def purpose(path: Path, head: bytes) -> str:
     """The use of a file of this program's; "" for other files.
 
@@ -235,10 +238,12 @@ def purpose(path: Path, head: bytes) -> str:
     head : its first bytes, of a directory b""
     """
     if path.is_dir():
+        tracks = [path / f"trajectory_{kind}.csv" for kind in ("smoothed", "filtered")]
+        track = next((track for track in tracks if track.is_file()), tracks[0])
+        if (path / LIVE_RECORDING).is_file():
+            return f"is the folder of a live dive; its log is {path / LIVE_RECORDING}"
         if (path / SUMMARY).is_file():
-            return (
-                f"is a results folder; rovgraph evaluate {path / 'trajectory_smoothed.csv'} REFERENCE reads its track"
-            )
+            return f"is a results folder; rovgraph evaluate {track} REFERENCE reads its track"
         return ""
     for beginning, what in BEGINNINGS.items():
         if head.startswith(beginning):

@@ -133,6 +133,21 @@ def is_plumb(elevation: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.abs(elevation) - 0.5 * np.pi) < PLUMB)
 
 
+def _look_at_reach(values: Array, key: str) -> Iterator[Said]:
+    for k, limit, expected in (
+        (0, FARTHEST_M, f"if they are in millimetres, state units: {{{key}: mm}}"),
+        (1, 2.0 * FARTHEST_M / SLOWEST_MPS, "travel times are there and back, in seconds"),
+    ):
+        known = values[np.isfinite(values[:, k]), k]
+        if len(known) and (median := float(np.median(known))) > limit:
+            what, unit = ("ranges", "m") if k == 0 else ("travel times", "s")
+            yield (
+                "error",
+                f"its {what} are {median:.4g} {unit} in the median, farther than sound reaches; {expected}",
+                "unit",
+            )
+
+
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
     bearing, elevation = in_degrees(values[:, 2:4])
     if bearing or elevation:
@@ -150,11 +165,13 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
 
 
 def _look_at_replies(values: Array, config: Config) -> Iterator[Said]:
+    yield from _look_at_reach(values, "usbl_range")
     yield from _look_at_directions(values, config)
     yield from look_at_sound_speed("usbl_sound_speed", values[:, -1])
 
 
 def _look_at_ranges(values: Array, config: Config) -> Iterator[Said]:
+    yield from _look_at_reach(values, "range")
     yield from look_at_sound_speed("range_sound_speed", values[:, -1])
 
 
@@ -202,6 +219,8 @@ USBL = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_reply,
+    together="usbl_bearing, usbl_elevation and usbl_range or usbl_travel_time, or usbl_x, usbl_y and usbl_z; "
+    "ranges alone are range or travel_time",
     look=_look_at_replies,
 )
 RANGE = Sensor(
@@ -220,6 +239,7 @@ RANGE = Sensor(
     may_begin_later=True,
     occasional=True,
     complete=_is_range,
+    together="range or travel_time",
     look=_look_at_ranges,
 )
 SHIP = Sensor(

@@ -17,6 +17,7 @@ from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Sa
 
 VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
 TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
+LOCKED = 0.8  # share of pings with bottom lock that is usual
 KNOWN_YAW_SD_DEG = 10.0  # sd of the yaw's prior up to which the mounting determines the direction of the rate's noise
 
 
@@ -154,7 +155,7 @@ def _bottom_lock(values: Array, config: Config) -> Iterator[Said]:
     """Share of valid pings, and their speed."""
     valid = values[:, 3] == 1.0
     share = float(valid.mean())
-    yield "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(values)} pings", "bottom lock"
+    yield "ok" if share >= LOCKED else "warning", f"bottom lock {share:.1%} of {len(values)} pings", "bottom lock"
     if not valid.any():
         return
     velocity = values[valid, :3]

@@ -27,6 +27,7 @@ BY_PRESSURE = "depth by pressure"  # begins what a log notes of it
 STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
 LEAST, MOST = 50_000.0, 108_500.0  # of air where people dive, mountain lakes included [Pa]
 AT_SEA = 87_000.0  # least that was ever measured at sea level [Pa]
+SHALLOW = 3.0 * STANDARD  # at 20 m
 SEA = 1025.0  # density [kg/m^3]
 PER_PSU = 35.16504 / 35.0  # of absolute salinity [g/kg]
 DEEPER_DBAR = 1000.0  # beyond a profile, whose water stays
@@ -262,8 +263,11 @@ def complaints(pascal: Array, factor: float, units: Mapping[str, float], source:
         )
     elif least < LEAST:
         said = f"{source}: pressure: {least:.4g} to {most:.4g} Pa, and no air has so little"
+        below = [unit for unit, f in units.items() if MOST < least / factor * f <= SHALLOW]
+        deeper = f"if it was never at the surface, state units: {{pressure: {below[-1]}}}" if below else ""
         if meant:
-            raise InputError(f"{said}; {better}")
+            raise InputError(f"{said}; {better}" + (f", or {deeper}" if below else ""))
         if most - least < GAUGE_PA:
-            raise InputError(f"{said}; if these are metres, name the column depth; else state its unit under units")
+            other = deeper or "else state its unit under units"
+            raise InputError(f"{said}; if these are metres, name the column depth; {other}")
         raise InputError(f"{said}; if the air's is taken off, state depth.surface_hpa: 0; else state units: pressure")

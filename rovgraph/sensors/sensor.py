@@ -228,6 +228,7 @@ class Sensor:
     calibration : variables that come with it, beside the built-in ones
     complete : from columns, shape (n, k), to the rows that are measurements, for one that may be written in several
         ways; None = those with all columns that are not optional
+    together : the columns that such a row needs, for people
     settings : keys of its section of the configuration, under ``sensors``; None = those of `SensorSettings`
     """
 
@@ -248,6 +249,7 @@ class Sensor:
     simulated_hz: float | None = None
     calibration: tuple[Variable, ...] = ()
     complete: Callable[[Array], NDArray[np.bool_]] | None = None
+    together: str = ""
     settings: type[SensorSettings] | None = None
 
     @cached_property

@@ -92,5 +92,6 @@ ADCP = Sensor(
     ),
     may_begin_later=True,
     complete=_is_cell,
+    together="adcp_range and a velocity",
 )
 LAYER = Sensor(WATER_LAYER, (), _layer, observes=Observed("velocity"))

@@ -175,9 +175,8 @@ class AcousticSampler:
     def _with_true_ship(self) -> Acoustics:
         """Exchanges with a ship that is known exactly, and with the system's own noise alone."""
         config, ship = self.config, self.config.ship
-        sure = ship.model_copy(update={"sd_m": 0.0, "heading_sd_deg": 0.0, "tilt_sd_deg": 0.0})
-        usbl = config.usbl.model_copy(update={"depth": "measured"})
-        out = Acoustics(config.model_copy(update={"ship": sure, "usbl": usbl}), self.instruments)
+        sure = {"sd_m": 0.0, "heading_sd_deg": 0.0, "tilt_sd_deg": 0.0}
+        out = Acoustics(config.with_values(ship=sure, usbl={"depth": "measured"}), self.instruments)
         time = np.arange(0.0, self.ship.duration + TRACK_S, TRACK_S).clip(max=self.ship.duration)
         if ship.north_m is None:
             out.signals["ship"].take(time, np.column_stack([self._antenna(time), np.full(len(time), np.nan)]))

@@ -49,9 +49,8 @@ def in_frame(path: Path, truth: Truth) -> tuple[Path, Truth]:
     config, env = truth.config, truth.config.environment
     steps = np.diff(path.motion(np.linspace(0.0, path.duration, 1000)).p_n, axis=0)
     way = float(np.linalg.norm(steps, axis=1).sum()) if truth.fix_interval is None else 0.0
-    env = env.model_copy(update={"frame": config.frame_at(env.latitude, way=way)})
-    truth = replace(truth, config=config.model_copy(update={"environment": env}))
-    return replace(path, latitude=env.earth_latitude), truth
+    config = config.with_values(environment={"frame": config.frame_at(env.latitude, way=way)})
+    return replace(path, latitude=config.environment.earth_latitude), replace(truth, config=config)
 
 
 def _turning(motion: Motion, config: Config) -> tuple[Array, Array, Array]:

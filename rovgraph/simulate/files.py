@@ -78,12 +78,12 @@ def known(dive: Dive, config: Config) -> Config:
     which their errors were drawn.
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
-    start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    recorded = with_priors_stated(config.as_recorded())
-    env = config.environment
-    if not math.isnan(dive.path.latitude):
-        env = env.model_copy(update={"frame": "earth"})
-    return recorded.model_copy(update={"start": start, "environment": env, "columns": {}, "units": {}})
+    return with_priors_stated(config.as_recorded()).with_values(
+        start={"north_m": float(north), "east_m": float(east)},
+        environment={} if math.isnan(dive.path.latitude) else {"frame": "earth"},
+        columns={},
+        units={},
+    )
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

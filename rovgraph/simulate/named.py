@@ -120,11 +120,7 @@ def lake() -> Config:
         "dvl_compass_deviation": {"estimate": True, "sd_deg": 1.0},
         "ahrs_deviation": {"estimate": True, "sd_deg": 1.0},
     }
-    calibration = config.calibration.model_copy(
-        update={name: getattr(config.calibration, name).model_copy(update=entry) for name, entry in entries.items()}
-    )
-    heading = config.heading.model_copy(update={"ahrs_sd_deg": 2.0})
-    return config.model_copy(update={"calibration": calibration, "heading": heading})
+    return config.with_values(calibration=entries, heading={"ahrs_sd_deg": 2.0})
 
 
 def falcon() -> Config:

@@ -23,7 +23,7 @@ from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
-from rovgraph.inference.initialise import declination_by_place, with_convergence
+from rovgraph.inference.resolve import convergence, declination_by_place
 from rovgraph.log import Log
 from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.model.config import Config
@@ -166,7 +166,9 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     config : what is believed of the vehicle; defaults where it is not given
     examined : result of `bridge_jumps` for the log with this configuration
     """
-    config = with_convergence(log, Config() if config is None else config, [])
+    config = Config() if config is None else config
+    if (north := convergence(log, config)) is not None:
+        config = config.with_values(environment={"convergence_deg": north})
     frozen = frozen_stretches(log, config)
     unfrozen = log_without(log, frozen)
     known: dict[Check, Check] = {
@@ -183,8 +185,13 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 
 
 def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: Config) -> dict[Check, list[Finding]]:
-    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading."""
+    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading.
+
+    Nor is bottom lock missed where the beams carry the dive.
+    """
     out = dict(found)
+    if any(f.kind == "bottom lock" and f.level == "ok" for f in found[beams]):
+        out[own] = [f for f in found[own] if f.kind != "bottom lock"]
     if any(f.kind == "axes" and f.level != "ok" for f in found[gravity]):
         out[headings] = [f for f in found[headings] if f.kind != "sign" or f.sensor == "mag"]
     wrong = {f.sensor for f in out[headings] if f.kind in ("sign", "unit") and f.level != "ok"}

@@ -34,6 +34,7 @@ from rovgraph.diagnosis.check.inertial import in_gap
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log import Log, Stream
+from rovgraph.log.units import UNITS
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, beliefs
 from rovgraph.problem.acoustics import Acoustics, Sightings, sightings, unusable_acoustics
@@ -58,6 +59,7 @@ FASTEST_SHIP_MPS, SHIP_JITTER_M = 15.0, 20.0  # of successive positions of one s
 TWO_SHIPS = 0.1  # of the steps, from which on two ships are in a log
 OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
 DEPTH_OFF_M = 1.0
+UNIT_FITS = 0.2  # logarithm of what another unit of the ranges leaves
 GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
 COARSE_M = 0.05  # noise of depths that are passed on with one digit
 NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
@@ -80,7 +82,7 @@ def usable(log: Log, config: Config, frame: str | None = None, late: float | Non
     if is_plumb(log["usbl"]["usbl_elevation"]).mean() > MOSTLY:
         return None  # `replies` reports it
     if frame is not None and frame != config.usbl.frame:
-        config = config.model_copy(update={"usbl": config.usbl.model_copy(update={"frame": frame})})
+        config = config.with_values(usbl={"frame": frame})
     replies = _sound(log, config)
     if len(replies) > MOST:
         replies = replies.take(np.unique(np.linspace(0, len(replies) - 1, MOST).astype(int)))
@@ -228,9 +230,8 @@ class _Beside:
         seen = usable(log, config)
         if seen is None:
             return None
-        arm = config.fix.model_copy(update={"lever_arm_m": config.usbl.beacon_arm_m})
         positions = replace(seen.positions, sensor="fix")
-        track = tracks(_with(log, positions), config.model_copy(update={"fix": arm}))
+        track = tracks(_with(log, positions), config.with_values(fix={"lever_arm_m": config.usbl.beacon_arm_m}))
         if track is None or track.plane.count < MIN_FIXES:
             return None
         sources = {track.sensor, *heading_sources(config, log.sensors)}
@@ -238,10 +239,9 @@ class _Beside:
 
     def fit(self, late: float, axes: "_Axes") -> _Fit | None:
         """Fit with stamps that are late, in some axes; None with too few replies."""
-        usbl = self.config.usbl
-        roll, pitch, yaw = usbl.mount_rpy_deg
+        roll, pitch, yaw = self.config.usbl.mount_rpy_deg
         mount = roll, pitch, yaw + math.degrees(axes.yaw)
-        config = self.config.model_copy(update={"usbl": usbl.model_copy(update={"mount_rpy_deg": mount})})
+        config = self.config.with_values(usbl={"mount_rpy_deg": mount})
         log = _with(self.log, _signed(self.log["usbl"], bearing=-1.0)) if axes.mirrored else self.log
         seen = usable(log, config, axes.frame, late)
         if seen is None:
@@ -536,7 +536,10 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         priors["usbl_arm"].sd,
     )
     sd = 1.2533 * noise * math.sqrt(inflation((errors - off).astype(np.complex128)) / len(errors))
-    if abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
+    unit = _unit_of_ranges(seen, errors)
+    if unit is not None:
+        yield Finding("usbl", "warning", f"{text}: state units: {{{unit}}}", "unit")
+    elif abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
         x, y, z = config.usbl.lever_arm_m
         text += f": check the head's depth below the waterline, usbl.lever_arm_m: [{x:g}, {y:g}, {z - off:.1f}] would "
         yield Finding("usbl", "warning", f"{text}mend it, and the elevation and the sound speed", "zero")
@@ -545,6 +548,16 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", text, "repeats")
     else:
         yield Finding("usbl", "ok", text)
+
+
+def _unit_of_ranges(seen: Sightings, errors: Array) -> str | None:
+    """The unit of ranges, as ``units`` states it, that makes depths below the head those of the depth sensor."""
+    below = float(np.median(seen.positions.data[:, 2] - seen.head[:, 2]))
+    ratio = below / (below - float(np.median(errors))) if below != np.median(errors) else 0.0
+    if ratio <= 0.0 or abs(math.log(ratio)) < math.log(2.0):
+        return None
+    near = (u for u, factor in UNITS["length"].items() if u != "m" and abs(math.log(ratio * factor)) < UNIT_FITS)
+    return next((f"usbl_range: {unit}" for unit in near), None)
 
 
 def _is_given(log: Log, config: Config, seen: Sightings) -> bool:

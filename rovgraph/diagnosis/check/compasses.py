@@ -30,7 +30,7 @@ from rovgraph.diagnosis.check.inertial import (
 from rovgraph.diagnosis.check.lags import MIN_WINDOWS, ORIENTATIONS, Signal, fit
 from rovgraph.diagnosis.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.geometry import Array, cross, rotate, skew
-from rovgraph.inference.initialise import dip_of_log, field_by_place
+from rovgraph.inference.resolve import dip_of_log, field_by_place
 from rovgraph.log import Log, Stream
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.rules import CLIPPED, FOLLOWS

@@ -17,13 +17,17 @@ from rovgraph.geometry import Array, log_rotation, matrix_from_rpy
 from rovgraph.log import Log, Stream
 from rovgraph.log.units import UNITS
 from rovgraph.model.config import Config, beliefs, mount_matrix
-from rovgraph.problem.beams import ENOUGH, ONE_PING_S, head_against_velocity, nearest
+from rovgraph.problem.beams import ENOUGH, ONE_PING_S, PingsByBeams, beam_sensors, head_against_velocity, nearest
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
-from rovgraph.sensors.dvl import axes_remedy
+from rovgraph.sensors import Level
+from rovgraph.sensors.dvl import LOCKED, axes_remedy
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
+from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.water_layer import CELLS, VELOCITIES
 
 LONGEST_LAG_S, LAG_STEP_S, SLOPE_S = 30.0, 0.5, 1.0  # of profiles against the depth, and over which it changes
+FARTHEST_M = 2000.0  # that a DVL of 38 kHz reaches
+CHANGE_S, CHANGE_M, TOGETHER = 5.0, 0.2, 0.7  # over which range and depth change, by how much, and correlation
 BETTER_LAG = 0.6  # of the error as it stands, that another lag or sign leaves
 BESIDE_S = 1.0  # between a profile and a ping
 AS_BOTTOM_MPS = 0.05  # between cells and bottom track
@@ -71,35 +75,80 @@ def beams(log: Log, config: Config) -> Iterator[Finding]:
     else:
         kind = found.kind if config.dvl.use == "beams" else ""
         yield Finding(BEAMS, "warning", f"{found.text}: {found.remedy}", kind)
+    if beam_sensors(config, log.streams)[0]:
+        share = _carried(log, config)
+        level: Level = "ok" if share >= LOCKED else "warning"
+        text = f"{share:.1%} of {len(log[BEAMS])} pings have a velocity or two beams that are used"
+        yield Finding(BEAMS, level, text, "bottom lock")
+
+
+def _carried(log: Log, config: Config) -> float:
+    """Share of the pings of beams that are used, by their velocity or by two beams or more."""
+    made, _ = PingsByBeams(config, instruments(config)).of_log(log.streams)
+    used, count = np.unique(np.concatenate([stream.time for stream in made]), return_counts=True)
+    time = log[BEAMS].time
+    carried = np.isin(time, used[count >= 2])
+    pings = valid_pings(log["dvl"]) if "dvl" in log and config.dvl.use == "auto" else None
+    if pings is not None and len(pings):
+        carried |= np.abs(pings.time[nearest(pings.time, time)] - time) < ONE_PING_S
+    return float(carried.mean())
 
 
 def ranges(log: Log, config: Config) -> Iterator[Finding]:
-    """Ranges of beams against its altitude: unit, and whether they are along the beam or straight down."""
+    """Ranges of beams against its altitude: unit, and whether they are along the beam or straight down.
+
+    Without altitude, against the depth: over a bottom without steps the one grows as the other shrinks.
+    """
     geometry = beam_geometry(config.dvl)
-    if geometry is None or not {BEAMS, "dvl_altitude"} <= log.sensors:
+    if geometry is None or BEAMS not in log:
         return
-    pings, altitude = log[BEAMS], log["dvl_altitude"]
-    near = nearest(altitude.time, pings.time)
-    high = altitude.data[near, 0]
-    usable = (np.abs(altitude.time[near] - pings.time) < ONE_PING_S) & (high > 0.0)
-    beams, cosine = beams_of(pings.data, geometry.numbers), abs(float(geometry.directions[:, 2].mean()))
+    beams, cosine = beams_of(log[BEAMS].data, geometry.numbers), abs(float(geometry.directions[:, 2].mean()))
+    beside = "dvl_altitude" if "dvl_altitude" in log else "depth"
     for name, other, measured, expected in (
         ("range", "distance", beams.range, 1.0 / cosine),
         ("distance", "range", beams.distance, cosine),
     ):
-        whole = usable & np.isfinite(measured).all(axis=1)  # a slope and a tilt cancel in the mean of all beams
-        if np.count_nonzero(whole) < ENOUGH:
+        mean = measured.mean(axis=1)  # of whole pings: in the mean of all beams a slope and a tilt cancel
+        known = mean[np.isfinite(mean)]
+        ratio = (_to_altitude if beside == "dvl_altitude" else _to_depth)(log, mean)
+        if ratio is None:
+            if len(known) and np.median(known) > FARTHEST_M:
+                text = f"dvl_beam_{name}_K is {np.median(known):.4g} m in the median, farther than a DVL reaches"
+                yield Finding(BEAMS, "warning", f"{text}: if it is in millimetres, state units: {{dvl_beam_range: mm}}")
             continue
-        ratio = float(np.median(measured[whole].mean(axis=1) / high[whole]))
+        text = f"dvl_beam_{name}_K {'is' if beside == 'dvl_altitude' else 'changes by'} {ratio:.3g} times {beside}"
         right = 1.0 / cosine if name == "range" else 1.0
-        if abs(np.log(ratio * expected / right)) < 0.25 * abs(np.log(cosine)):
-            text = f"dvl_beam_{name}_K is {ratio:.3g} times dvl_altitude, as {other}s are: name the columns {other}_K"
-            yield Finding(BEAMS, "warning", text)
+        along = abs(np.log(ratio * expected / right)) < 0.25 * abs(np.log(cosine))
+        if along and beside == "dvl_altitude":
+            yield Finding(BEAMS, "warning", f"{text}, as {other}s are: name the columns {other}_K")
         elif abs(np.log(ratio / right)) > np.log(2.0):
             unit = next((u for u, factor in UNITS["length"].items() if abs(np.log(ratio * factor / right)) < 0.3), None)
-            text = f"dvl_beam_{name}_K is {ratio:.3g} times dvl_altitude, expected {right:.3g}"
             remedy = "check their columns" if unit is None else f"state units: {{dvl_beam_range: {unit}}}"
-            yield Finding(BEAMS, "warning", f"{text}: {remedy}")
+            yield Finding(BEAMS, "warning", f"{text}, expected {right:.3g}: {remedy}")
+
+
+def _to_altitude(log: Log, mean: Array) -> float | None:
+    """Ratio of the mean range of each ping, shape (n,), to the altitude; None with too few."""
+    time, altitude = log[BEAMS].time, log["dvl_altitude"]
+    near = nearest(altitude.time, time)
+    high = altitude.data[near, 0]
+    usable = (np.abs(altitude.time[near] - time) < ONE_PING_S) & (high > 0.0) & np.isfinite(mean)
+    return float(np.median(mean[usable] / high[usable])) if np.count_nonzero(usable) >= ENOUGH else None
+
+
+def _to_depth(log: Log, mean: Array) -> float | None:
+    """Ratio of the changes of the mean range to those of the depth, upwards; None where they do not go together."""
+    known = np.isfinite(mean)
+    if "depth" not in log or min(int(known.sum()), len(log["depth"])) < ENOUGH:
+        return None
+    time, far = log[BEAMS].time[known], mean[known]
+    later = np.searchsorted(time, time + CHANGE_S)
+    first = np.flatnonzero(later < len(time))
+    sunk = np.interp(time, log["depth"].time, log["depth"]["depth"])
+    deeper, nearer = sunk[later[first]] - sunk[first], far[first] - far[later[first]]
+    if len(first) < ENOUGH or deeper.std() < CHANGE_M or np.corrcoef(deeper, nearer)[0, 1] < TOGETHER:
+        return None
+    return float(deeper @ nearer / (deeper @ deeper))
 
 
 def profiles(log: Log, config: Config) -> Iterator[Finding]:
@@ -126,7 +175,7 @@ def profiles(log: Log, config: Config) -> Iterator[Finding]:
     if turned < BETTER_LAG * error[now]:
         remedy = "state units: {adcp_velocity: -m/s}"
         yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
-    elif error[best] < BETTER_LAG * error[now]:
+    elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
         text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
         yield Finding(CELLS, "warning", f"{text}: state delay_s.adcp, or correct them", "lag")
     yield from _unmarked(log, cells, velocity)

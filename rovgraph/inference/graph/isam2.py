@@ -558,7 +558,7 @@ class IncrementalEstimator:
         """Take an interval: predicted and gated from iSAM2's estimate of the keyframe before, then added."""
         done = self.filter.step(problem, k, self.known, self.gates)
         self.take(problem, k, done.filtered, done.met)
-        self.history.append(self.known, done.met)
+        self.history.append(self.known, done.met, problem.keyframes)
         return done
 
     def take(self, problem: Problem, k: int, known: Gaussian, met: Met) -> None:

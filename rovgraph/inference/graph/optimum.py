@@ -6,7 +6,7 @@ of its last keyframe and of the calibration, which are factors of the next piece
 joint covariance given all data so far, every factor linearised at the same values, and the whole costs one elimination.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -21,7 +21,7 @@ from rovgraph.inference.graph.batch import DiveGraph, indeterminate, make_graph,
 from rovgraph.inference.graph.values import calibration_key, dimension, is_place, key, key_index
 from rovgraph.inference.optimum import Knowledge
 from rovgraph.model.calibration import TABLE, Belief
-from rovgraph.model.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY, State
+from rovgraph.model.state import BIAS, COLUMNS, DIMENSION, MOTION_STATE, PLACE, PLACE_DIM, POSE, VELOCITY, State
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
@@ -207,12 +207,23 @@ def newest_keys(graph: DiveGraph, places: Sequence[int] = ()) -> list[int]:
 
 
 def covariances(tree: gtsam.GaussianBayesTree) -> dict[int, Array]:
-    """Marginal covariances of all variables, by key, shape (d, d).
+    """Marginal covariances of all variables, by key, shape (d, d)."""
+    return joint_covariances(tree, ())[0]
+
+
+def joint_covariances(
+    tree: gtsam.GaussianBayesTree, groups: Iterable[tuple[int, ...]]
+) -> tuple[dict[int, Array], list[Array]]:
+    """Marginal covariances of all variables, by key, shape (d, d), and joint ones of groups of neighbours.
+
+    Variables that one factor ties stand together in a clique, that of the one which is eliminated first.
 
     From the roots down, as a clique's separator lies in its parent: with R x_f + S x_s = noise of unit
     variance, P_ff = R^-1 (1 + S P_ss S') R^-T and P_fs = -R^-1 S P_ss.
     """
     out: dict[int, Array] = {}
+    group_of = {k: group for group in groups for k in group}
+    joint: dict[tuple[int, ...], Array] = {}
     todo: list[tuple[gtsam.GaussianBayesTreeClique, dict[int, slice], Array]] = [
         (root, {}, np.empty((0, 0))) for root in tree.roots()
     ]
@@ -231,9 +242,14 @@ def covariances(tree: gtsam.GaussianBayesTree) -> dict[int, Array]:
         P[:m, m:] = -gain @ P[m:, m:]
         P[m:, :m] = P[:m, m:].T
         P[:m, :m] = root @ root.T - P[:m, m:] @ gain.T
-        out |= {k: P[part, part] for k, part in parts.items() if part.stop <= m}
+        frontal = {k: part for k, part in parts.items() if part.stop <= m}
+        out |= {k: P[part, part] for k, part in frontal.items()}
+        for group in {group_of[k] for k in frontal.keys() & group_of.keys()}:
+            if parts.keys() >= {*group}:
+                own = np.concatenate([np.r_[parts[k]] for k in group])
+                joint[group] = P[np.ix_(own, own)]
         todo += [(clique[child], parts, P) for child in range(clique.nrChildren())]
-    return out
+    return out, [joint[group] for group in groups]
 
 
 @dataclass(frozen=True)
@@ -284,20 +300,26 @@ class GraphOptimum:
 
     def covariances(self) -> dict[str, Array]:
         """As `rovgraph.inference.optimum.Optimum`."""
-        known = covariances(marginals(self.graph, self.solution.point, self.solution.gates))
-        out = {}
-        for variable in (POSE, VELOCITY, BIAS, *self.unknowns.estimated):
+        keyframes = [*zip(*(self._keys(variable) for variable in (POSE, VELOCITY, BIAS)), strict=True)]
+        tree = marginals(self.graph, self.solution.point, self.solution.gates)
+        known, together = joint_covariances(tree, keyframes)
+        out = {MOTION_STATE: self._with_considered(np.array(together), keyframes)}
+        out |= {variable: out[MOTION_STATE][:, own, own] for variable, own in COLUMNS.items()}
+        for variable in self.unknowns.estimated:
             keys = self._keys(variable)
-            P = np.array([known[one] for one in keys])
-            if self.unknowns.considered:
-                K = np.array([self._sensitivity[one] for one in keys])
-                P += K @ transpose(K)
-            out[variable] = P
+            out[variable] = self._with_considered(np.array([known[one] for one in keys]), [(one,) for one in keys])
         for variable in self.unknowns.considered:
             belief = self.beliefs[variable]
             prior = np.eye(belief.variable.dim) * belief.sd**2
             out[variable] = np.broadcast_to(prior, (self.graph.count, *prior.shape))
         return out
+
+    def _with_considered(self, P: Array, keys: Sequence[tuple[int, ...]]) -> Array:
+        """With the part of considered variables, shape as that of P: (n, d, d), each of variables with some keys."""
+        if not self.unknowns.considered:
+            return P
+        K = np.array([np.vstack([self._sensitivity[one] for one in group]) for group in keys])
+        return P + K @ transpose(K)
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.inference.optimum.Optimum`."""

@@ -151,8 +151,7 @@ def _with_sources(variant: Filter, log: Log, config: Config) -> Config:
         sources = ["ahrs" if "ahrs" in log else "mag"]
     else:
         sources = ["mag"] * variant.magnetometer + ["dvl"] * variant.compass
-    heading = config.heading.model_copy(update={"sources": tuple(sources)})
-    return config.model_copy(update={"heading": heading})
+    return config.with_values(heading={"sources": tuple(sources)})
 
 
 def _process(variant: Filter, log: Log, config: Config, known: KnownMotion | None) -> Process:

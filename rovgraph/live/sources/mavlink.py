@@ -100,7 +100,7 @@ class MavlinkDecoder:
         """A message of the readings that are finite but for what is optional in them."""
         good = tuple(r for r in found if _whole(r))
         if len(good) < len(found):
-            self._notify("not finite", "a value that is no number is left out")
+            self._notify("not finite", "a value that is not a number is left out")
         return Message(self._url, arrival, seconds or None, good, clock if seconds else "") if good else None
 
     def _said_usec(self, arrival: float, usec: float, *found: Reading, sender: str = "") -> Message | None:

@@ -54,7 +54,9 @@ def page_of(folder: Path) -> str:
 
         maker = study_page_of(source)
         if maker is None:
-            raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth or a study")
+            inside = source.folder / "smoothed"  # of a live dive
+            where = f"give {inside}" if inside.is_dir() else "give a results folder of smooth or a study"
+            raise InputError(f"{folder}: holds no results that have a page; {where}")
         return maker(source)
 
 
