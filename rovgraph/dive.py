@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rovgraph.diagnosis.acoustics import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons, find_head_errors
+from rovgraph.diagnosis.acoustics import find_head_errors
 from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, verdict_of
+from rovgraph.diagnosis.beacons import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons
 from rovgraph.diagnosis.check import Finding
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.diagnosis.statistics import find_advice, find_alarms, statistics

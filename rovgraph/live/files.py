@@ -49,7 +49,7 @@ from rovgraph.log.streams import RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
 from rovgraph.model.origin import Origin, north_east
 
-VERSION = 9
+VERSION = 10
 NAME = b"rovgraph checkpoint"
 ARRAY = "$array"
 NUMBERS = "biufc"  # kinds of dtypes: boolean, integer, unsigned, float, complex

@@ -15,15 +15,18 @@ import numpy as np
 from rovgraph.diagnosis.check.values import angles, gravity, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.filter import ErrorLayout
+from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
-from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
+from rovgraph.log.streams import SPACING_S, STREAMS, precedence
 from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
+from rovgraph.model.state import POSE
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
@@ -103,8 +106,6 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if not b.has_place}
-        self._only_beacon = len(config.beacons) == 1
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -135,7 +136,7 @@ class Intake:
             values = self._by_sound_speed(sensor, values)
         if sensor == "fix":  # a receiver knows less of its noise than others
             values = np.append(values, np.full(len(STREAMS["fix"]) - len(values), np.nan))
-        return None if sensor in ACOUSTICS and self._is_unplaced(sensor, values) else self._new(time, sensor, values)
+        return self._new(time, sensor, values)
 
     def _new(self, time: float, sensor: str, values: Array) -> Measurement | None:
         """A measurement of calibrated values; None where the sensor has just been heard at that time."""
@@ -169,23 +170,6 @@ class Intake:
             self._left_out["pressure", "less than any air's"] += 1
             return None
         return below
-
-    def _is_unplaced(self, sensor: str, values: Array) -> bool:
-        """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
-        named = self._names(sensor, values)
-        name = next((self._unplaced[value] for value in named if value in self._unplaced), None)
-        if self._only_beacon and all(math.isnan(value) for value in named):  # needs no name
-            name = next(iter(self._unplaced.values()), None)
-        if name is None:
-            return False
-        why = f"beacon {name} has no place"
-        if not self._left_out[sensor, why]:
-            remedy = (
-                "rovgraph smooth of the recording finds it; then state north_m, east_m, down_m and sds under beacons"
-            )
-            self.news.append((sensor, f"{why}, and its ranges are left out: {remedy}"))
-        self._left_out[sensor, why] += 1
-        return True
 
     def _names(self, sensor: str, values: Array) -> list[float]:
         """Those of its values that tell measurements of one time apart."""
@@ -373,4 +357,10 @@ def unlocated(engine: FixedLag) -> FixedLag:
     initial = engine.initial
     p_sd = np.append(np.full(2, ANYWHERE_M), initial.prior.p_sd[2])
     wide: InitialConditions = replace(initial, prior=replace(initial.prior, p_sd=p_sd))
-    return engine.continued(wide, ANYWHERE_M)
+
+    def anywhere(known: Gaussian, layout: ErrorLayout) -> Gaussian:
+        here, R_nb, P = layout.columns[POSE], known.state.R_nb[0], known.P.copy()
+        P[here, here][3:, 3:] += R_nb.T @ np.diag([ANYWHERE_M**2, ANYWHERE_M**2, 0.0]) @ R_nb
+        return replace(known, P=P)
+
+    return engine.continued(wide, anywhere)

@@ -21,6 +21,7 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.live.alarms import LiveAlarms
+from rovgraph.live.beacons import SHOWN_SD_M, UnplacedBeacons
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 ALTITUDE_S = 3.0  # longest age of an altitude
 PLACE_OF_RANGES = (*MOUNT, "dvl_lever_arm", "dvl_scale")  # calibration variables
 RANGE_S = 15.0  # longest age of an acoustic range that is shown
-BEACON_SD_M = 100.0  # beyond it a beacon is not shown
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 UNEXPECTED = "began after the first seconds, and is not used"
@@ -91,6 +91,7 @@ class Navigator:
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()
+        self._beacons: UnplacedBeacons | None = None  # until the dive begins
         self._events: list[Event] = []
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
@@ -218,6 +219,8 @@ class Navigator:
             return None
         keyframe, known = engine.ahead(self.time)
         t = engine.trajectory([keyframe], [known])
+        beacons = self._beacons
+        unplaced = () if beacons is None else beacons.shown(known, engine.filter.layout)
         latitude, longitude = self._intake.geodetic(t.p_n[0])
         return Solution(
             time=float(t.time[0]),
@@ -231,7 +234,7 @@ class Navigator:
             latitude=latitude,
             longitude=longitude,
             origin=self.origin,
-            calibration=self._calibration(engine, known),
+            calibration=self._calibration(engine, known) | ({} if beacons is None else beacons.calibration(unplaced)),
             current=self._current(engine, known),
             sensors=self._sensors(),
             events=self._take_events(),
@@ -242,7 +245,7 @@ class Navigator:
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
             **self._below(engine, known, t),
-            **self._acoustics(engine, known, t.p_n[0]),
+            **self._acoustics(engine, known, t.p_n[0], unplaced),
         )
 
     def state(self) -> dict[str, Any] | None:
@@ -261,6 +264,7 @@ class Navigator:
             "incoherence": np.array(self._incoherence.state()),
             "faults": self.faults.state(),
             "surface": np.array(self._intake.pressure.surface.state()),
+            "beacons": {} if self._beacons is None else self._beacons.state(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -275,6 +279,8 @@ class Navigator:
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
         self._intake.pressure.surface.restore(state["surface"].tolist())
+        if self._beacons is not None:
+            self._beacons.restore(state["beacons"])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
@@ -315,6 +321,7 @@ class Navigator:
             from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
             self.isam2 = IncrementalEstimator(initial, UPDATE_S)
+        self._beacons = UnplacedBeacons(initial, self.say, self.left_out, gathers=not self.smooth)
         keeps_all = self.smooth or self._reinitialisations is not None
         self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, True, keeps_all)
         if state is not None:
@@ -330,9 +337,9 @@ class Navigator:
         self._startup.measurements = []
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
-        began = host.perf_counter()
+        began, beacons = host.perf_counter(), self._beacons
         joining = self._joined(engine, m)
-        if joining is None:
+        if joining is None or (beacons is not None and beacons.take(joining, m)):
             return
         engine = joining
         before = engine.snapshots[-1] if engine.snapshots else None
@@ -347,10 +354,14 @@ class Navigator:
                 if (adopted := self._reinitialisations.adopted) is not None:
                     self.alarms.reinitialised(adopted)
                     self._reinitialisations.adopted = None
+                    if beacons is not None:
+                        beacons.reinitialised(adopted.time, adopted.p_n)
             if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
                 self._adopt(engine, self.isam2)
             if (stretch := self._incoherence.step(engine)) is not None:
                 self.alarms.taken_out(stretch)
+            if beacons is not None and (placed := beacons.place(engine)) is not None:
+                engine = self._go_on_with(placed, engine.oldest().time - float(engine.assembly.problem.time[0]))
             self.health.step(engine.snapshots)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
@@ -375,12 +386,12 @@ class Navigator:
             self.say(sensor, "unused", f"{sensor}: {UNEXPECTED} before what was recorded is smoothed")
         self.left_out[sensor, UNEXPECTED] += 1
 
-    def _go_on_with(self, engine: FixedLag) -> FixedLag:
+    def _go_on_with(self, engine: FixedLag, since: float = np.inf) -> FixedLag:
         self.engine = engine
         self._incoherence.forget()
         self.alarms.forget_smoothed()
         if self._reinitialisations is not None:
-            self._reinitialisations.again()
+            self._reinitialisations.again(since)
         return engine
 
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
@@ -402,6 +413,8 @@ class Navigator:
                 self.lose_isam2(str(error))
         self.health.passed(snapshot)
         self._incoherence.passed(snapshot)
+        if self._beacons is not None:
+            self._beacons.passed(snapshot)
         self.alarms.passed(snapshot, self.engine.filter, self.faults.watches, self.time)
 
     def _take_events(self) -> tuple[Event, ...]:
@@ -484,8 +497,10 @@ class Navigator:
         names = ("altitude", "altitude_sd", "bottom_depth", "bottom_depth_sd")
         return {name: found[name] for name in names} if math.isfinite(found["altitude"]) else {}
 
-    def _acoustics(self, engine: FixedLag, known: Gaussian, p_n: Array) -> dict[str, Any]:
-        """Ship, beacons and the newest ranges, for the page."""
+    def _acoustics(
+        self, engine: FixedLag, known: Gaussian, p_n: Array, unplaced: Sequence[BeaconPlace]
+    ) -> dict[str, Any]:
+        """Ship, beacons, with those that may lie on either side, and the newest ranges, for the page."""
         acoustics, columns = engine.assembly.acoustics, engine.filter.layout.columns
         if not acoustics.instruments:
             return {}
@@ -498,7 +513,7 @@ class Navigator:
                 if place in columns
                 else np.eye(2) * engine.filter.beliefs[place].sd ** 2
             )
-            if cov.trace() < BEACON_SD_M**2:
+            if cov.trace() < SHOWN_SD_M**2:
                 (north, east), sd = c[LAYOUT[place]].tolist(), np.sqrt(cov.diagonal()).tolist()
                 beacons[k] = BeaconPlace(str(beacon.name), north, east, sd[0], sd[1], float(cov[0, 1]))
                 down[k] = float(c[LAYOUT[depth]][0])
@@ -516,7 +531,7 @@ class Navigator:
         ship = acoustics.ship()
         return {
             "ship": None if ship is None else ShipPose(*ship),
-            "beacons": tuple(beacons.values()),
+            "beacons": (*beacons.values(), *unplaced),
             "ranges": tuple(ranges),
         }
 
