@@ -140,7 +140,7 @@ class FixedLag:
         self,
         initial: InitialConditions,
         revised: Revision = lambda known, layout: known,
-        earlier: Sequence[Measurement] = (),
+        again: Sequence[Measurement] = (),
     ) -> "FixedLag":
         """A filter with more sensors, or that believes something else, that continues from here.
 
@@ -148,7 +148,8 @@ class FixedLag:
         ----------
         initial : this filter's with more instruments, or another prior
         revised : from the estimate from which it continues, and the layout of its error, to what is believed of it
-        earlier : measurements that were kept out so far, for a smoother of the whole dive; they make no keyframes
+        again : all measurements so far of some sensors that make no keyframes, as they came, in place of what was
+            made of them; where the whole dive is kept
         """
         oldest = self.oldest()
         while self.snapshots[0] is not oldest:
@@ -156,10 +157,9 @@ class FixedLag:
         other = FixedLag(initial, self.lag_s, self.hold_s, self.passed, self.learn_noise, self.keeps_all)
         known = revised(_taken_over(self.filter, other.filter, oldest.known), other.filter.layout)
         other.assembly.restore(self.assembly.state(self.place(oldest) + 1, whole=True))
-        for measurement in earlier:
-            other.assembly.insert(measurement)
-        while len(other.assembly) <= self.place(oldest):  # made again, with these between them
-            other.assembly.extend(one=True)
+        if again:
+            other.assembly.time_offsets.assume(known.c)
+            other.assembly.take_again(again, self.place(oldest) + 1)
         other.snapshots = deque([replace(oldest, known=known)])
         other._go_on(other.assembly.newest - other.hold_s)
         return other

@@ -59,7 +59,6 @@ class Unplaced:
     ranges : ndarray, shape (n, WIDTH): time [s]; length and sd; where the vehicle was, and from there to the
         transducer, n; the distance that it had travelled; its altitude, NaN = unknown [m]
     places : where it may be, the likeliest first, at the newest look
-    earlier : all that came, while the whole dive is kept
     due : time of the next look [s]
     told : what was said of it, by kind
     """
@@ -69,7 +68,6 @@ class Unplaced:
     sensor: str = "range"
     ranges: Array = field(default_factory=lambda: np.empty((0, WIDTH)))
     places: list[Side] = field(default_factory=list)
-    earlier: list[Measurement] = field(default_factory=list)
     due: float = -math.inf
     told: set[str] = field(default_factory=set)
 
@@ -201,7 +199,6 @@ class UnplacedBeacons:
         self._left_out[count] += 1
         if self._gathers:
             self._gather(engine, m, number)
-            one.earlier = [*one.earlier, m] if engine.keeps_all else []
         else:
             self._tell(one, "unused", f"beacon {one.beacon.name} has no place, and its ranges are left out: {REMEDY}")
         return True
@@ -243,8 +240,13 @@ class UnplacedBeacons:
                 one.ranges[:, PLACE + k] = np.interp(one.ranges[:, TIME], time, p_n[:, k])
         self._before = None
 
-    def place(self, engine: FixedLag) -> FixedLag | None:
-        """A filter that goes on with beacons whose place has become clear; None without any."""
+    def place(self, engine: FixedLag, came: Sequence[Measurement]) -> FixedLag | None:
+        """A filter that goes on with beacons whose place has become clear; None without any.
+
+        Parameters
+        ----------
+        came : all exchanges so far, where the whole dive is kept
+        """
         if not self.all or self._before is None:
             return None
         now, found = self._before[0], list[tuple[PlacedBeacon, float]]()
@@ -258,18 +260,20 @@ class UnplacedBeacons:
             return None
         config, initial = engine.initial.config, engine.initial
         placed = {beacon.number: beacon.beacon for beacon, _ in found}
-        earlier = [m for number in placed for m in self.all[number].earlier if engine.keeps_all]
         beacons = tuple(placed.get(k, beacon) for k, beacon in enumerate(config.beacons))
         initial = replace(initial, config=config.model_copy(update={"beacons": beacons}))
         for number in placed:
             del self.all[number]
+        acoustics = engine.assembly.acoustics
+        sensors = {m.sensor for m in came if acoustics.beacon_of(m) in placed}
+        again = [m for m in came if m.sensor in sensors and acoustics.beacon_of(m) not in self.all]
 
         def revised(known: Gaussian, layout: ErrorLayout) -> Gaussian:
             for beacon, sd in found:
                 known = beacon.put(known, layout, sd)
             return known
 
-        return engine.continued(initial, revised, earlier)
+        return engine.continued(initial, revised, again)
 
     def _placed(self, engine: FixedLag, one: Unplaced, place: Array, down_sd: float) -> tuple[PlacedBeacon, float]:
         """A beacon that becomes a part of the estimate, and its sd beside the vehicle [m]."""
@@ -313,9 +317,9 @@ class UnplacedBeacons:
             for side in one.likely:
                 J = _beside(known, layout, side.place)
                 cov = side.covariance + J @ known.covariance @ J.T
-                (north, east, _), sd = side.place.tolist(), np.sqrt(cov.diagonal()).tolist()
-                behind = side.cost - one.places[0].cost
-                out.append(BeaconPlace(str(one.beacon.name), north, east, *sd, float(cov[0, 1]), behind))
+                (north, east, _), (north_sd, east_sd) = side.place.tolist(), np.sqrt(cov.diagonal()).tolist()
+                found = north, east, north_sd, east_sd, float(cov[0, 1]), side.cost - one.places[0].cost
+                out.append(BeaconPlace(str(one.beacon.name), *found))
         return out
 
     def calibration(self, shown: Sequence[BeaconPlace]) -> dict[str, tuple[float, float]]:

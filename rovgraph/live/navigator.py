@@ -16,6 +16,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom, bottom_under
+from rovgraph.inference.filter import ErrorLayout
 from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.trajectory import Trajectory
@@ -29,11 +30,12 @@ from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
 from rovgraph.live.solution import BeaconPlace, CurrentAt, Event, RangeCircle, SensorHealth, ShipPose, Solution
 from rovgraph.log import Log, Measurement, Stream
-from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
-from rovgraph.model.config import Config
+from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
+from rovgraph.model.config import Config, with_calibration
 from rovgraph.model.origin import Origin, flat_error, outgrows_plane
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
+from rovgraph.rules import sd_of_lag
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
 if TYPE_CHECKING:
@@ -92,6 +94,7 @@ class Navigator:
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()
         self._beacons: UnplacedBeacons | None = None  # until the dive begins
+        self._exchanges: list[Measurement] = []  # as they came, while the whole dive is kept
         self._events: list[Event] = []
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
@@ -297,6 +300,8 @@ class Navigator:
             self._ticked = self.time
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
+            kept = (one for one in self._exchanges if one.sensor != m.sensor or one.time < verdict.retract_since)
+            self._exchanges = list(kept)
         for one in (*verdict.late, *[m] * verdict.use):
             self._use(one)
         if not verdict.use and verdict.count:
@@ -337,9 +342,9 @@ class Navigator:
         self._startup.measurements = []
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
-        began, beacons = host.perf_counter(), self._beacons
+        began = host.perf_counter()
         joining = self._joined(engine, m)
-        if joining is None or (beacons is not None and beacons.take(joining, m)):
+        if joining is None or self._keeps(joining, m):
             return
         engine = joining
         before = engine.snapshots[-1] if engine.snapshots else None
@@ -347,24 +352,67 @@ class Navigator:
         if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
         if engine.snapshots and engine.snapshots[-1] is not before:
-            waited = 0.0
-            if self._reinitialisations is not None:
-                waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
-                engine.keeps_all = self._reinitialisations.pending
-                if (adopted := self._reinitialisations.adopted) is not None:
-                    self.alarms.reinitialised(adopted)
-                    self._reinitialisations.adopted = None
-                    if beacons is not None:
-                        beacons.reinitialised(adopted.time, adopted.p_n)
-            if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
-                self._adopt(engine, self.isam2)
+            waited = self._continue_from_smoothed(engine)
             if (stretch := self._incoherence.step(engine)) is not None:
                 self.alarms.taken_out(stretch)
-            if beacons is not None and (placed := beacons.place(engine)) is not None:
-                engine = self._go_on_with(placed, engine.oldest().time - float(engine.assembly.problem.time[0]))
+            engine = self._believe_what_is_shown(engine)
             self.health.step(engine.snapshots)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _keeps(self, engine: FixedLag, m: Measurement) -> bool:
+        """Keep an exchange as it came, as long as the whole dive is kept; whether it does not touch the track yet."""
+        if not engine.keeps_all or self.smooth:
+            self._exchanges.clear()
+        elif m.sensor in ACOUSTICS:
+            self._exchanges.append(m)
+        return self._beacons is not None and self._beacons.take(engine, m)
+
+    def _continue_from_smoothed(self, engine: FixedLag) -> float:
+        """Continue from the dive so far as it is smoothed, where that is ready; the time waited for it [s]."""
+        waited = 0.0
+        if self._reinitialisations is not None:
+            waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
+            engine.keeps_all = self._reinitialisations.pending
+            if (adopted := self._reinitialisations.adopted) is not None:
+                self.alarms.reinitialised(adopted)
+                self._reinitialisations.adopted = None
+                if self._beacons is not None:
+                    self._beacons.reinitialised(adopted.time, adopted.p_n)
+        if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
+            self._adopt(engine, self.isam2)
+        return waited
+
+    def _believe_what_is_shown(self, engine: FixedLag) -> FixedLag:
+        """A filter with the place of a beacon, or the latency of stamps, that the dive shows; the same without any."""
+        placed = None if self._beacons is None else self._beacons.place(engine, self._exchanges)
+        late = None if placed is not None else self._with_latency(engine)
+        changed = placed or late
+        if changed is None:
+            return engine
+        self._go_on_with(changed)
+        if self._reinitialisations is not None:  # the dive so far is smoothed with it
+            self._reinitialisations.anew(changed)
+        return changed
+
+    def _with_latency(self, engine: FixedLag) -> FixedLag | None:
+        """A filter that estimates how late acoustic stamps are, where that was said and the whole dive is kept."""
+        late, self._crosscheck.late = self._crosscheck.late, {}
+        if "usbl" not in late or not self._exchanges:
+            return None
+        lag, sd = late["usbl"]
+        stated = {"estimate": True, "mean": lag, "sd": sd_of_lag(sd)}
+        initial = replace(engine.initial, config=with_calibration(engine.initial.config, "usbl_time_offset", stated))
+        self._crosscheck.config = with_calibration(self._crosscheck.config, "usbl_time_offset", stated)
+
+        def revised(known: Gaussian, layout: ErrorLayout) -> Gaussian:
+            c = known.c.copy()
+            c[LAYOUT["usbl_time_offset"]] = lag
+            return replace(known, c=c)
+
+        again = [m for m in self._exchanges if m.sensor == "usbl"]
+        self.say("usbl", "assumed", f"its stamps are taken to be {lag:.1f} s late from now on, which is estimated")
+        return engine.continued(initial, revised, again)
 
     def _joined(self, engine: FixedLag, m: Measurement) -> FixedLag | None:
         """The filter that a measurement is for: one with its sensor; None where it cannot be used."""
@@ -386,12 +434,12 @@ class Navigator:
             self.say(sensor, "unused", f"{sensor}: {UNEXPECTED} before what was recorded is smoothed")
         self.left_out[sensor, UNEXPECTED] += 1
 
-    def _go_on_with(self, engine: FixedLag, since: float = np.inf) -> FixedLag:
+    def _go_on_with(self, engine: FixedLag) -> FixedLag:
         self.engine = engine
         self._incoherence.forget()
         self.alarms.forget_smoothed()
         if self._reinitialisations is not None:
-            self._reinitialisations.again(since)
+            self._reinitialisations.again()
         return engine
 
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:

@@ -109,10 +109,14 @@ class Reinitialisations:
         """Whether any reinitialisation is to come, so that the dive has to be kept."""
         return bool(self._due)
 
-    def again(self, since: float = np.inf) -> None:
-        """Start the smoothing again, for a filter with more sensors; from ``since`` on anew, as from the start [s]."""
+    def again(self) -> None:
+        """Start the smoothing again, for a filter with more sensors."""
         self._running = None
-        if self._due and np.isfinite(since):
+
+    def anew(self, engine: FixedLag) -> None:
+        """Smooth at once, and now and then as from the start, for a filter that has found what lies far off."""
+        since = engine.oldest().time - float(engine.assembly.problem.time[0])
+        if self._due:
             self._due = sorted({*self._due, since, *(since + after for after in REINITIALISE_AT_S)})
 
     def close(self) -> None:
