@@ -22,7 +22,7 @@ from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
 from rovgraph.inference.initialise import WINDOW_S, WITHIN_S, initialise
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
-from rovgraph.log.streams import SPACING_S, STREAMS, precedence
+from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
 from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
@@ -73,6 +73,10 @@ class _Patch(NamedTuple):
         return latitude, longitude if abs(longitude) <= 180.0 else longitude - math.copysign(360.0, longitude)
 
 
+BEACON = STREAMS["fix"].index("fix_beacon")  # of a fix, in degrees too
+SEVERAL = -1.0  # beacons have fixes, and nobody stated which is the vehicle's
+
+
 class Intake:
     """Calibrates, puts fixes on the map, and takes one measurement of a sensor at a time, as a log does.
 
@@ -85,6 +89,7 @@ class Intake:
     ----------
     origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
     frame : of a dive that has begun
+    beacon : number of the name that fixes of the vehicle have; None = not known yet
     news : (sensor, text) to be reported, since they were last taken
     """
 
@@ -106,6 +111,8 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
+        stated = config.positioned_beacon
+        self.beacon = None if stated is None else label_number(stated)
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -122,6 +129,8 @@ class Intake:
             if (below := self._depth(time, sensor, float(values[0]))) is None:
                 return None
             sensor, values = "depth", np.array([below])
+        if sensor in ("fix", GEODETIC) and len(values) > BEACON and not self._is_vehicles(float(values[BEACON])):
+            return None
         if sensor in ON_EARTH:
             if self.origin is None:
                 lat, lon = float(values[0]), float(values[1])
@@ -170,6 +179,21 @@ class Intake:
             self._left_out["pressure", "less than any air's"] += 1
             return None
         return below
+
+    def _is_vehicles(self, beacon: float) -> bool:
+        """Whether a fix is of the vehicle: without a name, or of the beacon that is stated, else of the only one."""
+        if math.isnan(beacon) or beacon == self.beacon:
+            return True
+        if self.beacon is None:
+            self.beacon = beacon
+            return True
+        if self.beacon != SEVERAL and self.config.positioned_beacon is None:
+            names = " and ".join(f"{one:.0f}" if one < 2**32 else "one with a name" for one in (self.beacon, beacon))
+            why = f"fixes are of several beacons, {names}, and none with a name is used any more"
+            self.news.append(("fix", f"{why}: state which is the vehicle's, fix: {{beacon: NAME}}"))
+            self.beacon = SEVERAL
+        self._left_out["fix", "of another beacon than the vehicle's, or of one among several"] += 1
+        return False
 
     def _names(self, sensor: str, values: Array) -> list[float]:
         """Those of its values that tell measurements of one time apart."""

@@ -267,6 +267,7 @@ class Navigator:
             "incoherence": np.array(self._incoherence.state()),
             "faults": self.faults.state(),
             "surface": np.array(self._intake.pressure.surface.state()),
+            "fix_beacon": self._intake.beacon,
             "beacons": {} if self._beacons is None else self._beacons.state(),
         }
 
@@ -282,6 +283,7 @@ class Navigator:
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
         self._intake.pressure.surface.restore(state["surface"].tolist())
+        self._intake.beacon = state["fix_beacon"]
         if self._beacons is not None:
             self._beacons.restore(state["beacons"])
         self.health.used.update(state["used"])

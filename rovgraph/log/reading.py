@@ -96,6 +96,7 @@ def read_streams(
     for table, cells, line in parts:
         names |= dict.fromkeys(table.names)
         _check_positions(cells, line, table.source)
+    _leave_out_other_beacons(parts, config, source)
     origin = _origin(config, [cells for _, cells, _ in parts], source)
     for table, cells, line in parts:
         found |= _streams(table, cells, line, origin)
@@ -434,6 +435,44 @@ def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
         lat, lon = valid_positions(cells[lat_lon[0]], cells[lat_lon[1]], line, source, of)
         known = ~np.isnan(lat) & ~np.isnan(lon)
         cells[lat_lon[0]], cells[lat_lon[1]] = np.where(known, lat, np.nan), np.where(known, lon, np.nan)
+
+
+BEACON = "fix_beacon"
+OF_FIX = tuple(name for name in (*LAT_LON, *STREAMS["fix"]) if name != BEACON)
+
+
+def _leave_out_other_beacons(
+    parts: Sequence[tuple[Table, dict[str, Array], Lines]], config: Config, source: str
+) -> None:
+    """Leave out fixes of other beacons than the vehicle's; a fix without a name is the vehicle's.
+
+    Raises
+    ------
+    InputError : it is not known which beacon is the vehicle's, or it has no fix
+    """
+    seen: dict[float, str] = {}
+    for table, cells, _ in parts:
+        if BEACON in cells:
+            there = np.isfinite([cells[name] for name in OF_FIX if name in cells]).any(axis=0)
+            written = table.frame[map_columns(table, config.columns)[BEACON]].dropna().unique()
+            texts = {label_number(str(text)): str(text).strip().removesuffix(".0") for text in written}
+            known = np.unique(cells[BEACON][there & ~np.isnan(cells[BEACON])])
+            seen |= {number: texts[number] for number in known.tolist()}
+    stated, names = config.positioned_beacon, sorted(seen.values())
+    if not seen or (stated is None and len(seen) == 1):
+        return
+    if stated is None or label_number(stated) not in seen:
+        why = "" if stated is None else f", and none of {stated}, which is stated"
+        raise InputError(
+            f"{source}: its fixes are of beacon{'s' * (len(names) > 1)} {', '.join(names[:6])}{why}; state which is "
+            f"the vehicle's, as fix_beacon has it: fix: {{beacon: {names[0]}}}"
+        )
+    for _, cells, _ in parts:
+        if BEACON in cells:
+            other = ~np.isnan(cells[BEACON]) & (cells[BEACON] != label_number(stated))
+            for name in OF_FIX:
+                if name in cells:
+                    cells[name] = np.where(other, np.nan, cells[name])
 
 
 def _origin(config: Config, parts: Sequence[dict[str, Array]], source: str) -> Origin | None:

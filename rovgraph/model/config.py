@@ -422,6 +422,12 @@ class Config(ConfigSection):
         return self.with_raw_magnetometer().model_copy(update={"delay_s": {}, "dvl": dvl})
 
     @property
+    def positioned_beacon(self) -> str | None:
+        """Name of the vehicle among beacons whose positions are fixes; None = not stated."""
+        stated = self.usbl.beacon if self.fix.beacon is None else self.fix.beacon
+        return None if stated is None else str(stated)
+
+    @property
     def knows_sound_speed(self) -> bool:
         """Whether the DVL's velocities are made by the speed of sound in the water."""
         true = self.dvl.sound_speed_mps, self.sound.profile, self.sound.salinity_psu
