@@ -105,9 +105,9 @@ def live(dive, seconds: float, named: float | None = None) -> SimpleNamespace:
 
 @pytest.mark.slow
 def test_live_a_beacon_has_two_places_until_a_turn_and_then_one():
-    dive = one_beacon(0, seconds=175.0)
+    dive = one_beacon(0, seconds=210.0)
     true = np.array([dive.hidden.others[f"beacon_1_{axis}"] for axis in ("north", "east")])
-    found = live(dive, 175.0)
+    found = live(dive, 210.0)
     before = [one for one in found.solutions if 60.0 < one.time < 100.0]
     for one in before:
         assert len(one.beacons) == 2 and one.beacons[0].behind == 0.0 and 0.0 <= one.beacons[1].behind < 9.2
