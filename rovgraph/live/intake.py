@@ -111,8 +111,8 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        stated = config.positioned_beacon
-        self.beacon = None if stated is None else label_number(stated)
+        own = config.positioned_beacon
+        self.beacon = None if own is None else label_number(own)
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
