@@ -81,3 +81,13 @@ def test_live_another_beacons_fix_sets_no_origin():
     assert intake.origin is None
     assert intake.measurement(2.0, Reading(GEODETIC, np.array([58.0, 15.0, 1.0, np.nan, np.nan, 7.0]))) is not None
     assert intake.origin is not None and intake.origin[0] == 58.0
+
+
+@pytest.mark.parametrize(("stated", "fixes"), [("{}", 16), ("fix: {beacon: 2}", 8), ("fix: {beacon: 3}", 0)])
+def test_a_recording_that_is_resumed_is_not_refused(tmp_path, stated, fixes):
+    path = log_of(tmp_path / "log.csv", ("1", "2"))
+    imu = "time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z,fix_north,fix_east,fix_beacon\n"
+    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    path.write_text(imu + "".join(f"{t},0,0,-9.8,0,0,0,{north},{east},{of}\n" for t, north, east, of in rows))
+    log = read_log(path, parse_config(stated), as_received=True)
+    assert (len(log["fix"]) if "fix" in log else 0) == fixes
