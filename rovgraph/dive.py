@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rovgraph.diagnosis.acoustics import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons, find_head_errors
+from rovgraph.diagnosis.acoustics import find_head_errors
 from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, verdict_of
+from rovgraph.diagnosis.beacons import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons
 from rovgraph.diagnosis.check import Finding
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.diagnosis.statistics import find_advice, find_alarms, statistics
@@ -238,16 +239,16 @@ class _Solver:
         self.estimates.append(batch.dead_reckoning())
 
     def learns_by(self, search: Search) -> bool:
-        """Whether a search finds in the optimum what was not believed; it is believed from now on."""
+        """Whether a search finds in the optimum what was not believed, or a rival; it is believed from now on."""
         if not isinstance(self.best, ChainOptimum):
             return False
         found, rivals = search(self.best, self.initial.config, self.dive({}).alarms)
         for one in found:
             self.initial = self.initial.believing(one.beliefs)
+        self.found, self.rivals = (*self.found, *found), (*self.rivals, *rivals)
         if found:
-            self.found, self.rivals = (*self.found, *found), (*self.rivals, *rivals)
             self.before = self.before or self.estimates[0].trajectory
-        return bool(found)
+        return bool(found or rivals)
 
     def result(self) -> DiveEstimates:
         """The dive, with what brings its variance, and what was found in it."""

@@ -211,9 +211,14 @@ def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
     late = round(config.delay_s.get(sensor, 0.0) + lag, 4) + 0.0
     delay = f"state delay_s: {{{sensor}: {late:.2g}}}"
     if sensor == "usbl":
-        entry = f"{{estimate: true, mean: {lag:.2g}, sd: {max(0.1, 3.0 * sd):.2g}}}"
+        entry = f"{{estimate: true, mean: {lag:.2g}, sd: {sd_of_lag(sd):.2g}}}"
         return f"{delay}, or calibration.usbl_time_offset: {entry}"
     return f"{delay}, or correct fix.lever_arm_m" if sensor == "fix" else delay  # under way the two are alike
+
+
+def sd_of_lag(sd: float) -> float:
+    """With which a latency of acoustic stamps is estimated that was found with an sd [s]."""
+    return max(0.1, 3.0 * sd)
 
 
 def rule_table() -> str:

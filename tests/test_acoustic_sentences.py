@@ -559,14 +559,17 @@ def live(data: bytes, config: Config, recorded: bool = True) -> tuple[list[Messa
 
 
 def of(messages: list[Message], sensor: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times and values of a sensor's readings."""
+    """Times and values of a sensor's readings, NaN where one has fewer."""
     found = [
         (m.arrival if m.stamp is None else m.stamp, r.values)
         for m in messages
         for r in m.readings
         if r.sensor == sensor
     ]
-    return np.array([time for time, _ in found]), np.array([values for _, values in found])
+    out = np.full((len(found), max((len(values) for _, values in found), default=0)), np.nan)
+    for row, (_, values) in zip(out, found, strict=True):
+        row[: len(values)] = values
+    return np.array([time for time, _ in found]), out
 
 
 SNS = "PSIMSNS,1200??.35,B01,1,1,2.0,-1.0,0.0,91.0,,,0.0,,M"
@@ -598,6 +601,7 @@ def test_live_replies_are_fixes_where_they_are_filtered_or_their_axes_are_not_st
     at_start = 0 if change[0] else 1  # until an acoustic sentence is heard, a fix is the vehicle's
     close(time[-19:], file["time"][-19:], atol=1e-3)
     close(values[-18:, :2], np.column_stack([file["fix_lat"], file["fix_lon"]])[-18:], atol=1e-9)
+    assert set(values[-18:, 5]) == set(file["fix_beacon"]) == {label_number("B01")}
     assert len(of(messages, "usbl")[0]) == 0 and len(time) <= 20 + at_start
     assert any("is a fix" in text for text in heard.texts)
 

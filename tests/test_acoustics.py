@@ -18,8 +18,6 @@ from rovgraph.geometry import exp_rotation, matrix_from_rpy
 from rovgraph.inference import correlated_noise
 from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
-from rovgraph.live.intake import Intake
-from rovgraph.live.message import Reading
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import LAYOUT, TABLE, USBL_MOUNT
 from rovgraph.model.config import Config, parse_config
@@ -225,12 +223,6 @@ def test_another_transponder_at_the_same_time_ends_no_dive():
     assert left_out == {("usbl", "another transponder than the first, without usbl.beacon"): 1}
 
 
-def test_a_range_without_a_name_to_an_unplaced_beacon_is_left_out_live():
-    intake, range_only = Intake(parse_config("beacons: [{name: wreck}]"), Counter()), [9.0, *[np.nan] * 5]
-    assert intake.measurement(1.0, Reading("range", np.array(range_only))) is None
-    assert "beacon wreck has no place" in intake.news[0][1]
-
-
 def test_elevations_that_stand_at_90_degrees_are_named():
     values = reply(5.0, 150.0, 0.3, 0.8).data.repeat(50, axis=0)
     assert not list(SENSORS["usbl"].look(values, Config()))
@@ -400,6 +392,25 @@ def test_restored_from_its_state_an_assembly_goes_on_with_the_ship():
             assembly.extend()
         assembly.extend(finish=True)
     same(before.problem.rows[-100:], after.problem.rows[-100:])
+
+
+@pytest.mark.parametrize("sensor", ["range", "usbl"])
+def test_exchanges_that_are_taken_again_give_what_they_gave_in_their_time(sensor):
+    log, config = below_a_ship()
+    initial, measurements = initialise(log, config), [*log.measurements()]
+    usual, again = assembly_of(initial), assembly_of(initial)
+    first = next(m for m in measurements if m.sensor == sensor)  # from which clocks drift
+    for m in measurements:
+        usual.insert(m)
+        if m.sensor != sensor or m is first or m.time > 30.0:  # half of them are kept out
+            again.insert(m)
+    for assembly in (usual, again):
+        assembly.extend()
+    n = len(again)
+    again.take_again([m for m in measurements if m.sensor == sensor], n)
+    assert len(again) == n
+    same(usual.problem.rows, again.problem.rows)
+    same(usual.problem.of, again.problem.of)
 
 
 def rms(log_config: tuple[Log, Config], dive: Dive, **keys: object) -> tuple[float, object]:

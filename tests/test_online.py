@@ -353,7 +353,7 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypat
 def test_a_checkpoint_that_is_damaged_is_said_in_one_line(case, tmp_path):
     files = Files(tmp_path, case.config, Warnings())
     files.close()
-    (tmp_path / "checkpoint").write_bytes(b"rovgraph checkpoint 9 0000\nx")
+    (tmp_path / "checkpoint").write_bytes(b"rovgraph checkpoint 10 0000\nx")
     with pytest.raises(InputError, match="damaged"):
         Files(tmp_path, case.config, Warnings(), resume=True)
 

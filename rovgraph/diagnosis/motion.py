@@ -162,6 +162,7 @@ def found_noise(evidence: Evidence) -> Iterator[Statistic]:
 
 def rivals(evidence: Evidence) -> Iterator[Statistic]:
     """How far apart the explanations put the track that are clear each by itself."""
+    as_clearly = "as clearly as what was found" if evidence.revealed else "better than noise does"
     track = evidence.main.trajectory
     for rival in evidence.rivals:
         if len(rival.p_n) != len(track) or evidence.optimum is None:
@@ -176,8 +177,8 @@ def rivals(evidence: Evidence) -> Iterator[Statistic]:
             float(track.time[k]),
             float(track.time[k]),
             rms_of(np.sqrt(square)),
-            f"{TABLE[rival.error.variable].about} explains the dive as clearly as what was found, and puts the track "
-            f"up to {np.linalg.norm(d[k]):.2g} m elsewhere; the stated sd covers both",
+            f"{TABLE[rival.error.variable].about} explains the dive {as_clearly}, and puts the track up to "
+            f"{np.linalg.norm(d[k]):.2g} m elsewhere; the stated sd covers both",
             f"find out which is so, and state the other as exact: calibration.{rival.error.variable}: "
             "{estimate: false}",
         )

@@ -170,7 +170,7 @@ def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> 
         return [_placed(best, place)], []
     # a score test's figure z is worth z^2 / 2 of log likelihood
     clear = [error for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
-    return [_lasting(best, error) for error in clear], rivals if clear else []
+    return [_lasting(best, error) for error in clear], rivals if clear or not errors else []
 
 
 def _named_elsewhere(alarms: Sequence[Alarm], best: ChainOptimum) -> bool:

@@ -190,7 +190,8 @@ def find_correlated_noise(
     """
     found: list[GaussMarkovError] = []
     rivals: list[Rival] = []
-    now, passed = _Baseline.of(best), {*without, *_hidden_by_ranges(best.chain)}
+    hidden = [name for name in _hidden_by_ranges(best.chain) if name not in without]
+    now, passed = _Baseline.of(best), {*without, *hidden}
     while True:
         candidates = [_most_likely(now, probe) for probe in _probes(now, passed)]
         steps = _steps(now, passed)
@@ -207,11 +208,14 @@ def find_correlated_noise(
         error, now = clear[0]
         found.append(error)
     beside = {error.variable for error in found}
-    return found, [rival for rival in rivals if rival.error.variable not in beside]
+    rivals = [rival for rival in rivals if rival.error.variable not in beside]
+    probes = _probes(now, LASTING.keys() - {*hidden}) if hidden else []
+    fits = [_fit(now, _most_likely(now, probe)) for probe in probes]
+    return found, rivals + [Rival(error, fit.solution.point.p_n) for error, fit in fits if error.gain >= CLEAR]
 
 
 def _hidden_by_ranges(chain: Chain) -> tuple[str, ...]:
-    """The DVL's error of scale, where all else are ranges to beacons that nobody placed.
+    """The DVL's error of scale, where all else are ranges to beacons that nobody placed: it is a rival, never found.
 
     Such a beacon moves with the track, so the scales of the DVL and of the ranges (the speed of sound) are nearly one
     sum: both grew together to 4 % where a gyro's scale was wrong.

@@ -15,7 +15,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.inference.estimate import body_trajectory, velocity_covariance
-from rovgraph.inference.filter import FilterEngine
+from rovgraph.inference.filter import ErrorLayout, FilterEngine
 from rovgraph.inference.filter_step import FilterGates, Gaussian, Met, states_of
 from rovgraph.inference.remembered_places import RememberedPlace
 from rovgraph.inference.trajectory import Trajectory
@@ -27,6 +27,7 @@ from rovgraph.model.state import POSE
 from rovgraph.problem.assembly import InsertResult, assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
 
+Revision = Callable[[Gaussian, ErrorLayout], Gaussian]
 KEPT_S = 30.0  # of the dive, behind the lag: the filter may have to go back so far
 
 
@@ -136,22 +137,30 @@ class FixedLag:
         """The keyframe of a snapshot among those that are kept."""
         return snapshot.index - self.assembly.forgotten
 
-    def continued(self, initial: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
-        """A filter with more sensors, or a less certain position, that continues from here.
+    def continued(
+        self,
+        initial: InitialConditions,
+        revised: Revision = lambda known, layout: known,
+        again: Sequence[Measurement] = (),
+    ) -> "FixedLag":
+        """A filter with more sensors, or that believes something else, that continues from here.
 
         Parameters
         ----------
         initial : this filter's with more instruments, or another prior
-        position_sd : that is added to north and east [m]
+        revised : from the estimate from which it continues, and the layout of its error, to what is believed of it
+        again : all measurements so far of some sensors that make no keyframes, as they came, in place of what was
+            made of them; where the whole dive is kept
         """
         oldest = self.oldest()
         while self.snapshots[0] is not oldest:
             self.passed(self.snapshots.popleft())
         other = FixedLag(initial, self.lag_s, self.hold_s, self.passed, self.learn_noise, self.keeps_all)
-        known = _taken_over(self.filter, other.filter, oldest.known)
-        here, R_nb = other.filter.layout.columns[POSE], known.state.R_nb[0]
-        known.P[here, here][3:, 3:] += R_nb.T @ np.diag([position_sd**2, position_sd**2, 0.0]) @ R_nb
+        known = revised(_taken_over(self.filter, other.filter, oldest.known), other.filter.layout)
         other.assembly.restore(self.assembly.state(self.place(oldest) + 1, whole=True))
+        if again:
+            other.assembly.time_offsets.assume(known.c)
+            other.assembly.take_again(again, self.place(oldest) + 1)
         other.snapshots = deque([replace(oldest, known=known)])
         other._go_on(other.assembly.newest - other.hold_s)
         return other

@@ -47,9 +47,10 @@ from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, read_log
 from rovgraph.log.streams import RECEIVED, STREAMS, VERSION_COLUMN, all_columns
 from rovgraph.model.config import AS_WRITTEN, Config
+from rovgraph.model.config_sections import Fix
 from rovgraph.model.origin import Origin, north_east
 
-VERSION = 9
+VERSION = 10
 NAME = b"rovgraph checkpoint"
 ARRAY = "$array"
 NUMBERS = "biufc"  # kinds of dtypes: boolean, integer, unsigned, float, complex
@@ -522,8 +523,9 @@ class Files:
             env = self.config.environment
             env = env.model_copy(update={"frame": self.config.frame_at(env.latitude or 0.0)})  # as `Intake` has it
             # recorded under rovgraph's own names, in SI
-            return replace(read_log(path, Config(environment=env), keep_pressure=True), config=None)
-        return Log.from_frame(_last_rows(path, origin_of(self.state)), source=str(path), keep_pressure=True)
+            own = Fix(beacon=self.config.positioned_beacon)
+            return replace(read_log(path, Config(environment=env, fix=own), as_received=True), config=None)
+        return Log.from_frame(_last_rows(path, origin_of(self.state)), source=str(path), as_received=True)
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""

@@ -15,6 +15,8 @@ import numpy as np
 from rovgraph.diagnosis.check.values import angles, gravity, turn_rates
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.filter import ErrorLayout
+from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FixedLag
 from rovgraph.inference.gyrocompassing import ALIGN_S, why_not
 from rovgraph.inference.initialise import WINDOW_S, initialise
@@ -25,6 +27,7 @@ from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
 from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
+from rovgraph.model.state import POSE
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
@@ -71,6 +74,10 @@ class _Patch(NamedTuple):
         return latitude, longitude if abs(longitude) <= 180.0 else longitude - math.copysign(360.0, longitude)
 
 
+BEACON = STREAMS["fix"].index("fix_beacon")  # of a fix, in degrees too
+SEVERAL = -1.0  # beacons have fixes, and nobody stated which is the vehicle's
+
+
 class Intake:
     """Calibrates, puts fixes on the map, and takes one measurement of a sensor at a time, as a log does.
 
@@ -83,6 +90,7 @@ class Intake:
     ----------
     origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
     frame : of a dive that has begun
+    beacon : number of the name that fixes of the vehicle have; None = not known yet
     news : (sensor, text) to be reported, since they were last taken
     """
 
@@ -104,8 +112,8 @@ class Intake:
         self._sizes: dict[str, int] = {}
         self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
         self._unknown: set[str] = set()  # columns that are reported
-        self._unplaced = {label_number(str(b.name)): str(b.name) for b in config.beacons if not b.has_place}
-        self._only_beacon = len(config.beacons) == 1
+        own = config.positioned_beacon
+        self.beacon = None if own is None else label_number(own)
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -122,6 +130,8 @@ class Intake:
             if (below := self._depth(time, sensor, float(values[0]))) is None:
                 return None
             sensor, values = "depth", np.array([below])
+        if sensor in ("fix", GEODETIC) and len(values) > BEACON and not self._is_vehicles(float(values[BEACON])):
+            return None
         if sensor in ON_EARTH:
             if self.origin is None:
                 lat, lon = float(values[0]), float(values[1])
@@ -136,7 +146,7 @@ class Intake:
             values = self._by_sound_speed(sensor, values)
         if sensor == "fix":  # a receiver knows less of its noise than others
             values = np.append(values, np.full(len(STREAMS["fix"]) - len(values), np.nan))
-        return None if sensor in ACOUSTICS and self._is_unplaced(sensor, values) else self._new(time, sensor, values)
+        return self._new(time, sensor, values)
 
     def _new(self, time: float, sensor: str, values: Array) -> Measurement | None:
         """A measurement of calibrated values; None where the sensor has just been heard at that time."""
@@ -171,22 +181,20 @@ class Intake:
             return None
         return below
 
-    def _is_unplaced(self, sensor: str, values: Array) -> bool:
-        """Whether an exchange is with a beacon whose place a recorded dive would have to show first."""
-        named = self._names(sensor, values)
-        name = next((self._unplaced[value] for value in named if value in self._unplaced), None)
-        if self._only_beacon and all(math.isnan(value) for value in named):  # needs no name
-            name = next(iter(self._unplaced.values()), None)
-        if name is None:
-            return False
-        why = f"beacon {name} has no place"
-        if not self._left_out[sensor, why]:
-            remedy = (
-                "rovgraph smooth of the recording finds it; then state north_m, east_m, down_m and sds under beacons"
-            )
-            self.news.append((sensor, f"{why}, and its ranges are left out: {remedy}"))
-        self._left_out[sensor, why] += 1
-        return True
+    def _is_vehicles(self, beacon: float) -> bool:
+        """Whether a fix is of the vehicle: without a name, or of the beacon that is stated, else of the only one."""
+        if math.isnan(beacon) or beacon == self.beacon:
+            return True
+        if self.beacon is None:
+            self.beacon = beacon
+            return True
+        if self.beacon != SEVERAL and self.config.positioned_beacon is None:
+            names = " and ".join(f"{one:.0f}" if one < 2**32 else "one with a name" for one in (self.beacon, beacon))
+            why = f"fixes are of several beacons, {names}, and none with a name is used any more"
+            self.news.append(("fix", f"{why}: state which is the vehicle's, fix: {{beacon: NAME}}"))
+            self.beacon = SEVERAL
+        self._left_out["fix", "of another beacon than the vehicle's, or of one among several"] += 1
+        return False
 
     def _names(self, sensor: str, values: Array) -> list[float]:
         """Those of its values that tell measurements of one time apart."""
@@ -374,4 +382,10 @@ def unlocated(engine: FixedLag) -> FixedLag:
     initial = engine.initial
     p_sd = np.append(np.full(2, ANYWHERE_M), initial.prior.p_sd[2])
     wide: InitialConditions = replace(initial, prior=replace(initial.prior, p_sd=p_sd))
-    return engine.continued(wide, ANYWHERE_M)
+
+    def anywhere(known: Gaussian, layout: ErrorLayout) -> Gaussian:
+        here, R_nb, P = layout.columns[POSE], known.state.R_nb[0], known.P.copy()
+        P[here, here][3:, 3:] += R_nb.T @ np.diag([ANYWHERE_M**2, ANYWHERE_M**2, 0.0]) @ R_nb
+        return replace(known, P=P)
+
+    return engine.continued(wide, anywhere)

@@ -16,11 +16,13 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom, bottom_under
+from rovgraph.inference.filter import ErrorLayout
 from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.live.alarms import LiveAlarms
+from rovgraph.live.beacons import SHOWN_SD_M, UnplacedBeacons
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
@@ -28,11 +30,12 @@ from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
 from rovgraph.live.solution import BeaconPlace, CurrentAt, Event, RangeCircle, SensorHealth, ShipPose, Solution
 from rovgraph.log import Log, Measurement, Stream
-from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
-from rovgraph.model.config import Config
+from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
+from rovgraph.model.config import Config, with_calibration
 from rovgraph.model.origin import Origin, flat_error, outgrows_plane
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
+from rovgraph.rules import sd_of_lag
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 
 if TYPE_CHECKING:
@@ -41,7 +44,6 @@ if TYPE_CHECKING:
 ALTITUDE_S = 3.0  # longest age of an altitude
 PLACE_OF_RANGES = (*MOUNT, "dvl_lever_arm", "dvl_scale")  # calibration variables
 RANGE_S = 15.0  # longest age of an acoustic range that is shown
-BEACON_SD_M = 100.0  # beyond it a beacon is not shown
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 UNEXPECTED = "began after the first seconds, and is not used"
@@ -90,6 +92,8 @@ class Navigator:
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()
+        self._beacons: UnplacedBeacons | None = None  # until the dive begins
+        self._exchanges: list[Measurement] = []  # as they came, while the whole dive is kept
         self._events: list[Event] = []
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
@@ -217,6 +221,8 @@ class Navigator:
             return None
         keyframe, known = engine.ahead(self.time)
         t = engine.trajectory([keyframe], [known])
+        beacons = self._beacons
+        unplaced = () if beacons is None else beacons.shown(known, engine.filter.layout)
         latitude, longitude = self._intake.geodetic(t.p_n[0])
         return Solution(
             time=float(t.time[0]),
@@ -230,7 +236,7 @@ class Navigator:
             latitude=latitude,
             longitude=longitude,
             origin=self.origin,
-            calibration=self._calibration(engine, known),
+            calibration=self._calibration(engine, known) | ({} if beacons is None else beacons.calibration(unplaced)),
             current=self._current(engine, known),
             sensors=self._sensors(),
             events=self._take_events(),
@@ -241,7 +247,7 @@ class Navigator:
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
             **self._below(engine, known, t),
-            **self._acoustics(engine, known, t.p_n[0]),
+            **self._acoustics(engine, known, t.p_n[0], unplaced),
         )
 
     def state(self) -> dict[str, Any] | None:
@@ -260,6 +266,8 @@ class Navigator:
             "incoherence": np.array(self._incoherence.state()),
             "faults": self.faults.state(),
             "surface": np.array(self._intake.pressure.surface.state()),
+            "fix_beacon": self._intake.beacon,
+            "beacons": {} if self._beacons is None else self._beacons.state(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -274,6 +282,9 @@ class Navigator:
         self._incoherence.restore(state["incoherence"].tolist())
         self.faults.restore(state["faults"])
         self._intake.pressure.surface.restore(state["surface"].tolist())
+        self._intake.beacon = state["fix_beacon"]
+        if self._beacons is not None:
+            self._beacons.restore(state["beacons"])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
@@ -290,6 +301,8 @@ class Navigator:
             self._ticked = self.time
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
+            kept = (one for one in self._exchanges if one.sensor != m.sensor or one.time < verdict.retract_since)
+            self._exchanges = list(kept)
         for one in (*verdict.late, *[m] * verdict.use):
             self._use(one)
         if not verdict.use and verdict.count:
@@ -314,6 +327,7 @@ class Navigator:
             from rovgraph.inference.graph.isam2 import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
             self.isam2 = IncrementalEstimator(initial, UPDATE_S)
+        self._beacons = UnplacedBeacons(initial, self.say, self.left_out, gathers=not self.smooth)
         keeps_all = self.smooth or self._reinitialisations is not None
         self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, True, keeps_all)
         if state is not None:
@@ -331,7 +345,7 @@ class Navigator:
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
         began = host.perf_counter()
         joining = self._joined(engine, m)
-        if joining is None:
+        if joining is None or self._keeps(joining, m):
             return
         engine = joining
         before = engine.snapshots[-1] if engine.snapshots else None
@@ -339,20 +353,67 @@ class Navigator:
         if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
         if engine.snapshots and engine.snapshots[-1] is not before:
-            waited = 0.0
-            if self._reinitialisations is not None:
-                waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
-                engine.keeps_all = self._reinitialisations.pending
-                if (adopted := self._reinitialisations.adopted) is not None:
-                    self.alarms.reinitialised(adopted)
-                    self._reinitialisations.adopted = None
-            if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
-                self._adopt(engine, self.isam2)
+            waited = self._continue_from_smoothed(engine)
             if (stretch := self._incoherence.step(engine)) is not None:
                 self.alarms.taken_out(stretch)
+            engine = self._believe_what_is_shown(engine)
             self.health.step(engine.snapshots)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _keeps(self, engine: FixedLag, m: Measurement) -> bool:
+        """Keep an exchange as it came, as long as the whole dive is kept; whether it does not touch the track yet."""
+        if not engine.keeps_all or self.smooth:
+            self._exchanges.clear()
+        elif m.sensor in ACOUSTICS:
+            self._exchanges.append(m)
+        return self._beacons is not None and self._beacons.take(engine, m)
+
+    def _continue_from_smoothed(self, engine: FixedLag) -> float:
+        """Continue from the dive so far as it is smoothed, where that is ready; the time waited for it [s]."""
+        waited = 0.0
+        if self._reinitialisations is not None:
+            waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
+            engine.keeps_all = self._reinitialisations.pending
+            if (adopted := self._reinitialisations.adopted) is not None:
+                self.alarms.reinitialised(adopted)
+                self._reinitialisations.adopted = None
+                if self._beacons is not None:
+                    self._beacons.reinitialised(adopted.time, adopted.p_n)
+        if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
+            self._adopt(engine, self.isam2)
+        return waited
+
+    def _believe_what_is_shown(self, engine: FixedLag) -> FixedLag:
+        """A filter with the place of a beacon, or the latency of stamps, that the dive shows; the same without any."""
+        placed = None if self._beacons is None else self._beacons.place(engine, self._exchanges)
+        late = None if placed is not None else self._with_latency(engine)
+        changed = placed or late
+        if changed is None:
+            return engine
+        self._go_on_with(changed)
+        if self._reinitialisations is not None:  # the dive so far is smoothed with it
+            self._reinitialisations.anew(changed)
+        return changed
+
+    def _with_latency(self, engine: FixedLag) -> FixedLag | None:
+        """A filter that estimates how late acoustic stamps are, where that was said and the whole dive is kept."""
+        late, self._crosscheck.late = self._crosscheck.late, {}
+        if "usbl" not in late or not self._exchanges:
+            return None
+        lag, sd = late["usbl"]
+        stated = {"estimate": True, "mean": lag, "sd": sd_of_lag(sd)}
+        initial = replace(engine.initial, config=with_calibration(engine.initial.config, "usbl_time_offset", stated))
+        self._crosscheck.config = with_calibration(self._crosscheck.config, "usbl_time_offset", stated)
+
+        def revised(known: Gaussian, layout: ErrorLayout) -> Gaussian:
+            c = known.c.copy()
+            c[LAYOUT["usbl_time_offset"]] = lag
+            return replace(known, c=c)
+
+        again = [m for m in self._exchanges if m.sensor == "usbl"]
+        self.say("usbl", "assumed", f"its stamps are taken to be {lag:.1f} s late from now on, which is estimated")
+        return engine.continued(initial, revised, again)
 
     def _joined(self, engine: FixedLag, m: Measurement) -> FixedLag | None:
         """The filter that a measurement is for: one with its sensor; None where it cannot be used."""
@@ -401,6 +462,8 @@ class Navigator:
                 self.lose_isam2(str(error))
         self.health.passed(snapshot)
         self._incoherence.passed(snapshot)
+        if self._beacons is not None:
+            self._beacons.passed(snapshot)
         self.alarms.passed(snapshot, self.engine.filter, self.faults.watches, self.time)
 
     def _take_events(self) -> tuple[Event, ...]:
@@ -483,8 +546,10 @@ class Navigator:
         names = ("altitude", "altitude_sd", "bottom_depth", "bottom_depth_sd")
         return {name: found[name] for name in names} if math.isfinite(found["altitude"]) else {}
 
-    def _acoustics(self, engine: FixedLag, known: Gaussian, p_n: Array) -> dict[str, Any]:
-        """Ship, beacons and the newest ranges, for the page."""
+    def _acoustics(
+        self, engine: FixedLag, known: Gaussian, p_n: Array, unplaced: Sequence[BeaconPlace]
+    ) -> dict[str, Any]:
+        """Ship, beacons, with those that may lie on either side, and the newest ranges, for the page."""
         acoustics, columns = engine.assembly.acoustics, engine.filter.layout.columns
         if not acoustics.instruments:
             return {}
@@ -497,7 +562,7 @@ class Navigator:
                 if place in columns
                 else np.eye(2) * engine.filter.beliefs[place].sd ** 2
             )
-            if cov.trace() < BEACON_SD_M**2:
+            if cov.trace() < SHOWN_SD_M**2:
                 (north, east), sd = c[LAYOUT[place]].tolist(), np.sqrt(cov.diagonal()).tolist()
                 beacons[k] = BeaconPlace(str(beacon.name), north, east, sd[0], sd[1], float(cov[0, 1]))
                 down[k] = float(c[LAYOUT[depth]][0])
@@ -515,7 +580,7 @@ class Navigator:
         ship = acoustics.ship()
         return {
             "ship": None if ship is None else ShipPose(*ship),
-            "beacons": tuple(beacons.values()),
+            "beacons": (*beacons.values(), *unplaced),
             "ranges": tuple(ranges),
         }
 

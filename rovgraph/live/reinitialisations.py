@@ -32,7 +32,7 @@ from rovgraph.problem.problem import Problem
 from rovgraph.rules import RULES
 
 Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
-_Smoothed = tuple[Gaussian, list[Statistic]]
+_Smoothed = tuple[Gaussian, list[Statistic], Optimum]
 
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 FREED = 20  # keyframes, after each new one, once no re-initialisation needs them: thousands at once take 40 ms
@@ -46,11 +46,14 @@ class Adopted:
     ----------
     smoothed, filtered : by the smoothed dive so far, and as the filter had it
     shown : what the smoothed dive shows of constants and noise
+    time, p_n : ndarray, shapes (n,), (n, 3), of the smoothed dive's keyframes, and where they are, at the IMU
     """
 
     smoothed: Trajectory
     filtered: Trajectory
     shown: list[Statistic]
+    time: Array
+    p_n: Array
 
 
 @dataclass
@@ -109,6 +112,12 @@ class Reinitialisations:
         """Start the smoothing again, for a filter with more sensors."""
         self._running = None
 
+    def anew(self, engine: FixedLag) -> None:
+        """Smooth at once, and now and then as from the start, for a filter that has found what lies far off."""
+        since = engine.oldest().time - float(engine.assembly.problem.time[0])
+        if self._due:
+            self._due = sorted({*self._due, since, *(since + after for after in REINITIALISE_AT_S)})
+
     def close(self) -> None:
         """Wait for nothing any more; no keyframe comes after it."""
         self._stop()
@@ -134,7 +143,7 @@ class Reinitialisations:
         if not self.patient and not future.done():
             return
         began = host.perf_counter()
-        known, self._shown = future.result()
+        known, self._shown, best = future.result()
         self.waited += host.perf_counter() - began
         oldest, gates, dive = engine.oldest().index, dict[str, float](), engine.assembly.problem
         for k in range(index + 1, oldest + 1):
@@ -143,7 +152,7 @@ class Reinitialisations:
         before = next((snapshot for snapshot in engine.snapshots if snapshot.index == newest), None)
         if engine.adopt(newest, known) and before is not None:
             after, filtered = (engine.trajectory([before.keyframe], [one]) for one in (known, before.known))
-            self.adopted = Adopted(after, filtered, self._shown)
+            self.adopted = Adopted(after, filtered, self._shown, best.problem.time, best.state.p_n)
         self._due.pop(0)
         self._running = None
         if not self._due:
@@ -171,7 +180,7 @@ def _smoothed(
     """
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
     known, best = reinitialised(engine, dive, states)
-    return known, _shown(best, engine.initial, before, dvl_contradicted)
+    return known, _shown(best, engine.initial, before, dvl_contradicted), best
 
 
 def _shown(

@@ -349,11 +349,13 @@ class Crosscheck:
     Attributes
     ----------
     config : what is believed of mountings and of stamps that are known to be late
+    late : how late stamps of a sensor are, and the sd [s], where it was said
     dvl_contradicted : the IMU's acceleration contradicts the DVL's axes or clock in the newest window
     """
 
     config: Config
     dvl_contradicted: bool = False
+    late: dict[str, tuple[float, float]] = field(default_factory=dict)
     _window: dict[str, Stream] = field(default_factory=dict)
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
@@ -432,6 +434,7 @@ class Crosscheck:
                 self._said[key] = now
                 zero = f"; 0 s is {start:.1f} s" if finding.kind == "jump" else ""
                 events.append(Event(now, finding.sensor, kind, f"{finding.text}{zero}"))
+                self.late |= {} if finding.lag is None else {finding.sensor: finding.lag}
         self._suspected = suspected
         yield events
 

@@ -61,7 +61,10 @@ class ShipPose(NamedTuple):
 
 
 class BeaconPlace(NamedTuple):
-    """An acoustic beacon, where the estimate has it [m, m^2]."""
+    """An acoustic beacon, where the estimate has it, or one of two places where it may be [m, m^2].
+
+    ``behind`` is the cost beyond that of the likeliest place while the path has not told which; NaN once it has.
+    """
 
     name: str
     north: float
@@ -69,6 +72,7 @@ class BeaconPlace(NamedTuple):
     north_sd: float
     east_sd: float
     cov_north_east: float
+    behind: float = math.nan
 
 
 class RangeCircle(NamedTuple):
@@ -114,7 +118,7 @@ class Solution:
     latency_s : from the arrival of the newest measurement to this solution [s], None in a replay
     update_s : duration of the newest update [s]
     current : by profiles of the water, at depths about the vehicle's, the shallowest first
-    ship, beacons, ranges : of an acoustic system: the ship, beacons whose place is known, the newest ranges
+    ship, beacons, ranges : of an acoustic system: the ship, beacons in their place or in one of two, the newest ranges
     """
 
     time: float

@@ -45,7 +45,7 @@ class Log:
 
     @staticmethod
     def from_frame(
-        frame: pd.DataFrame, config: Config | None = None, source: str = "log", keep_pressure: bool = False
+        frame: pd.DataFrame, config: Config | None = None, source: str = "log", as_received: bool = False
     ) -> "Log":
         """Make a log from a data frame, as `read_log` would from a file.
 
@@ -54,7 +54,7 @@ class Log:
         frame : columns of a log (docs/log-format.md), one row per event; the index is ignored
         config : for the frame's columns, units, delays and magnetometer's calibration
         source : name for messages
-        keep_pressure : a stream "pressure" stays, beside "depth"; else it becomes "depth"
+        as_received : a stream "pressure" stays, beside "depth", else it becomes "depth"; fixes of all beacons stay
 
         Raises
         ------
@@ -64,7 +64,7 @@ class Log:
         -----
         DataWarning : what was ignored or sorted
         """
-        return _log([table_of_frame(frame, source)], config, source, keep_pressure=keep_pressure)
+        return _log([table_of_frame(frame, source)], config, source, as_received=as_received)
 
     @staticmethod
     def from_arrays(
@@ -238,7 +238,7 @@ class Log:
             yield Measurement(t, names[k], data[k][i], rows[k][i])
 
 
-def read_log(path: Path | str, config: Config | None = None, keep_pressure: bool = False) -> Log:
+def read_log(path: Path | str, config: Config | None = None, as_received: bool = False) -> Log:
     """Read a log, and what lies beside it: each beam of its DVL in ``log.dvl_beams.csv``, profiles in ``log.adcp.csv``.
 
     Parameters
@@ -246,7 +246,7 @@ def read_log(path: Path | str, config: Config | None = None, keep_pressure: bool
     path : CSV, gzipped CSV or Parquet
     config : for the log's columns, units and delays, and the magnetometer's calibration: times are those of the
         measurements, and everything that takes the log sees the field
-    keep_pressure : of `Log.from_frame`
+    as_received : of `Log.from_frame`
 
     Raises
     ------
@@ -260,7 +260,7 @@ def read_log(path: Path | str, config: Config | None = None, keep_pressure: bool
         table = read_table(path)
         beams = beams_beside(Path(path), config_or_defaults(config))
         cells = cells_beside(Path(path), config_or_defaults(config))
-    log = _log([table], config, table.source, texts, keep_pressure)
+    log = _log([table], config, table.source, texts, as_received)
     return log.with_beams(beams).with_profiles(cells)
 
 
@@ -269,13 +269,13 @@ def _log(
     config: Config | None,
     source: str,
     before: Iterable[str] = (),
-    keep_pressure: bool = False,
+    as_received: bool = False,
 ) -> Log:
     """A log of tables that share no stream, with what was warned of ``before`` and while its streams were made."""
     config = config_or_defaults(config)
     with collected_warnings() as texts:
         notes: list[str] = []
-        streams, origin = read_streams(tables, config, source, notes, keep_pressure)
+        streams, origin = read_streams(tables, config, source, notes, as_received)
     return Log(source, streams, origin, config, (*before, *texts), notes=tuple(notes))
 
 

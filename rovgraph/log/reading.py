@@ -66,7 +66,7 @@ def read_streams(
     config: Config,
     source: str,
     notes: list[str] | None = None,
-    keep_pressure: bool = False,
+    as_received: bool = False,
 ) -> tuple[dict[str, Stream], Origin | None]:
     """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
@@ -75,7 +75,7 @@ def read_streams(
     tables : whose columns feed different streams
     source : their name, for messages
     notes : to be added to, how it was read
-    keep_pressure : they are not turned into depths
+    as_received : pressures are not turned into depths, and fixes of all beacons stay where none is stated
 
     Returns
     -------
@@ -96,12 +96,13 @@ def read_streams(
     for table, cells, line in parts:
         names |= dict.fromkeys(table.names)
         _check_positions(cells, line, table.source)
+    _leave_out_other_beacons(parts, config, source, not as_received)
     origin = _origin(config, [cells for _, cells, _ in parts], source)
     for table, cells, line in parts:
         found |= _streams(table, cells, line, origin)
     if not found:
         raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
-    if not keep_pressure:
+    if not as_received:
         _add_depth(found, config, origin, source, [] if notes is None else notes, names)
     found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
@@ -434,6 +435,44 @@ def _check_positions(cells: dict[str, Array], line: Lines, source: str) -> None:
         lat, lon = valid_positions(cells[lat_lon[0]], cells[lat_lon[1]], line, source, of)
         known = ~np.isnan(lat) & ~np.isnan(lon)
         cells[lat_lon[0]], cells[lat_lon[1]] = np.where(known, lat, np.nan), np.where(known, lon, np.nan)
+
+
+BEACON = "fix_beacon"
+OF_FIX = tuple(name for name in (*LAT_LON, *STREAMS["fix"]) if name != BEACON)
+
+
+def _leave_out_other_beacons(
+    parts: Sequence[tuple[Table, dict[str, Array], Lines]], config: Config, source: str, refuses: bool
+) -> None:
+    """Leave out fixes of other beacons than the vehicle's; a fix without a name is the vehicle's.
+
+    Raises
+    ------
+    InputError : ``refuses``, and it is not known which beacon is the vehicle's, or it has no fix
+    """
+    seen: dict[float, str] = {}
+    for table, cells, _ in parts:
+        if BEACON in cells:
+            there = np.isfinite([cells[name] for name in OF_FIX if name in cells]).any(axis=0)
+            written = table.frame[map_columns(table, config.columns)[BEACON]].dropna().unique()
+            texts = {label_number(str(text)): str(text).strip().removesuffix(".0") for text in written}
+            known = np.unique(cells[BEACON][there & ~np.isnan(cells[BEACON])])
+            seen |= {number: texts[number] for number in known.tolist()}
+    stated, names = config.positioned_beacon, sorted(seen.values())
+    if not seen or (stated is None and (len(seen) == 1 or not refuses)):
+        return
+    if refuses and (stated is None or label_number(stated) not in seen):
+        why = "" if stated is None else f", and none of {stated}, which is stated"
+        raise InputError(
+            f"{source}: its fixes are of beacon{'s' * (len(names) > 1)} {', '.join(names[:6])}{why}; state which is "
+            f"the vehicle's, as fix_beacon has it: fix: {{beacon: {names[0]}}}"
+        )
+    for _, cells, _ in parts:
+        if BEACON in cells:
+            other = ~np.isnan(cells[BEACON]) & (cells[BEACON] != label_number(str(stated)))
+            for name in OF_FIX:
+                if name in cells:
+                    cells[name] = np.where(other, np.nan, cells[name])
 
 
 def _origin(config: Config, parts: Sequence[dict[str, Array]], source: str) -> Origin | None:

@@ -416,6 +416,12 @@ class Config(ConfigSection):
         return self.with_raw_magnetometer().with_values(delay_s={}, dvl={"sound_speed_set_mps": None})
 
     @property
+    def positioned_beacon(self) -> str | None:
+        """Name of the vehicle among beacons whose positions are fixes; None = not stated."""
+        stated = self.usbl.beacon if self.fix.beacon is None else self.fix.beacon
+        return None if stated is None else str(stated)
+
+    @property
     def knows_sound_speed(self) -> bool:
         """Whether the DVL's velocities are made by the speed of sound in the water."""
         true = self.dvl.sound_speed_mps, self.sound.profile, self.sound.salinity_psu
@@ -507,6 +513,13 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
             sd = (name in unchecked and variable.unchecked_sd) or belief.sd
             entries[name] = {key: round(float(np.rad2deg(sd)), 12) if variable.angular else sd}
     return config.with_values(calibration=entries)
+
+
+def with_calibration(config: Config, name: str, stated: Mapping[str, object]) -> Config:
+    """The configuration with other keys of a calibration variable."""
+    given = config.calibration
+    entry = getattr(given, name).model_copy(update=dict(stated))
+    return config.model_copy(update={"calibration": given.model_copy(update={name: entry})})
 
 
 def load_config(path: Path | str | None = None) -> Config:

@@ -436,6 +436,7 @@ class Fix(ConfigSection):
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is rejected")
     readmit_s: Readmission = 300.0
+    beacon: str | int | None = Field(None, description="fix_beacon of the vehicle; null = usbl.beacon, or the only one")
 
 
 class Place(ConfigSection):

@@ -216,6 +216,16 @@ class Acoustics:
             out += [Measurement(t, raw.sensor, values, line) for t, values, line in rows]
         return out
 
+    def beacon_of(self, m: Measurement) -> int | None:
+        """The place in ``beacons`` of the other end of an exchange, as the sensor has it; None = another end."""
+        if m.sensor == "usbl":
+            return None if self.config.usbl.head == "ship" else self._beacon(float(m.values[7]))
+        return None if float(m.values[3]) in self._receivers else self._beacon(float(m.values[2]))
+
+    def _beacon(self, label: float) -> int | None:
+        """The place in ``beacons`` of a name; a single beacon needs none."""
+        return 0 if math.isnan(label) and len(self._places) == 1 else self._places.get(label)
+
     def _lasts(self, sensor: str) -> float:
         """How long an exchange waits for what the ship says, and for other receivers that hear it [s]."""
         if sensor == "range":
@@ -362,14 +372,12 @@ class Acoustics:
             self._choose_transponder(label, why)
             return names, [Other()] * len(stream)
         others, strange = [], np.zeros(len(stream), bool)
-        for k, (beacon, of) in enumerate(zip(label.tolist(), receiver.tolist(), strict=True)):
+        for k, (named, of) in enumerate(zip(label.tolist(), receiver.tolist(), strict=True)):
             if of in self._receivers:
                 others.append(Other(arm_s=self._receivers[of]))
                 names[k] = of
-            elif math.isnan(beacon) and len(self._places) == 1:
-                others.append(Other(0))
-            elif beacon in self._places:
-                others.append(Other(self._places[beacon]))
+            elif (beacon := self._beacon(named)) is not None:
+                others.append(Other(beacon))
             else:
                 others.append(Other())
                 strange[k] = stream.sensor == "range" or bool(self._places)

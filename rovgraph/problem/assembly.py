@@ -295,6 +295,15 @@ class Assembly:
             self._last = self._place_of(self._come - 1)
             self._due = -math.inf
 
+    def take_again(self, some: Sequence[Measurement], n: int) -> None:
+        """Take all measurements so far of some sensors anew, which make no keyframes; ``n`` are made again."""
+        for sensor in {m.sensor for m in some}:
+            self.remove(sensor, -math.inf, -math.inf)
+        for m in some:
+            self.insert(m)
+        while len(self) < n and self.extend(one=True):
+            pass
+
     @property
     def acoustics(self) -> Acoustics:
         """What is known of the ship, and of acoustic replies."""

@@ -406,7 +406,7 @@ class ShipsFile:
         """The channel of replies along the same axes."""
         of_log = [name for name in SENSORS["usbl"].column_names if name != "usbl_beacon"]
         filled = [name for name in of_log if any(name in reply.columns for _, reply in group.used)]
-        rows = [[t, *(r.columns.get(n, math.nan) for n in filled), _label(r.beacon)] for t, r in group.used]
+        rows = [[t, *(r.columns.get(n, math.nan) for n in filled), label_of(r.beacon)] for t, r in group.used]
         table = np.array(rows)[np.argsort([row[0] for row in rows], kind="stable")]
         columns = dict(zip(("time", *filled, "usbl_beacon"), table.T, strict=True))
         if np.isnan(columns["usbl_beacon"]).all():
@@ -466,13 +466,17 @@ class ShipsFile:
             self.left[name, "the ship's position, or her heading (HDT), is not known"] += int((~known).sum())
             if known.any():
                 sd = np.array([reply.sd for _, reply in rows])
-                cells = zip(when[known], np.column_stack([lat, lon, sd])[known], strict=True)
-                made[name] = self._channel("fix", name, _in_time(cells, FIX[:3]))
+                beacon = np.array([label_of(reply.beacon) for _, reply in rows])
+                cells = zip(when[known], np.column_stack([lat, lon, sd, beacon])[known], strict=True)
+                columns = _in_time(cells, (*FIX[:3], FIX[-1]))
+                named = {key: values for key, values in columns.items() if key != FIX[-1] or np.isfinite(values).any()}
+                made[name] = self._channel("fix", name, named)
         return made
 
 
 def _fixes(rows: Iterable[tuple[float, AcousticPosition]]) -> dict[str, Array]:
-    columns = _in_time(((t, (p.lat, p.lon, *p.noise)) for t, p in rows), FIX)
+    of_fix = ((t, (p.lat, p.lon, *p.noise, math.nan if p.of_ship else label_of(p.beacon))) for t, p in rows)
+    columns = _in_time(of_fix, FIX)
     return {name: values for name, values in columns.items() if name not in FIX[3:] or not np.isnan(values).all()}
 
 
@@ -488,5 +492,6 @@ def _is_slow(time: Array) -> bool:
     return len(time) < 2 or median_step(time) > SLOW_S
 
 
-def _label(beacon: str) -> float:
+def label_of(beacon: str) -> float:
+    """The number that stands for a transponder's name; NaN without one."""
     return label_number(beacon) if beacon else math.nan

@@ -91,7 +91,7 @@ def _noise_of_fix(values: Array, believed: Instrument, config: Config) -> Array:
 
 def _noise_of_fixes(values: Array, sd: float) -> Array:
     """The same of n fixes, shape (n, 3)."""
-    own, own_east, covariance = values[:, 2:].T
+    own, own_east, covariance = values[:, 2:5].T
     north = np.where(own > 0.0, np.minimum(own, LARGEST_SD), sd)  # receivers without an estimate write 0
     east = np.where(own_east > 0.0, np.minimum(own_east, LARGEST_SD), north)
     return np.column_stack([north, east, np.nan_to_num(covariance)])
@@ -156,6 +156,7 @@ FIX = Sensor(
         Column("fix_sd", "length", optional=True, largest=5e3),
         Column("fix_east_sd", "length", optional=True, largest=5e3),
         Column("fix_cov_ne", "area", optional=True),
+        Column("fix_beacon", optional=True, label=True),
     ),
     positioning,
     refused=_impossible,

@@ -380,7 +380,7 @@ def _late(beside: _Beside, found: _Lag) -> list[Finding]:
         f"acoustic positions come {abs(total):.1f} s {'late' if total > 0.0 else 'early'} beside the DVL's track "
         f"and the ship's (sd {found.sd:.2f} s): {remedy_of_lag(beside.config, 'usbl', total, found.sd)}"
     )
-    return [Finding("usbl", "warning", text, "lag")]
+    return [Finding("usbl", "warning", text, "lag", lag=(total, found.sd))]
 
 
 def _other_axes(beside: _Beside, as_is: _Fit) -> str:

@@ -29,6 +29,7 @@ class Finding:
     text : one sentence, with the numbers it rests on
     kind : in a word, which docs/check.md explains
     share : of the sensor's measurements, that an estimate leaves out for it; None where it is about something else
+    lag : how late stamps are, and its sd [s]; None where it is about something else
     """
 
     sensor: str
@@ -36,6 +37,7 @@ class Finding:
     text: str
     kind: Kind = ""
     share: float | None = None
+    lag: tuple[float, float] | None = None
 
     @property
     def wrong(self) -> bool:
@@ -103,6 +105,7 @@ class Report:
         known: dict[str, Any] = _without_nan(asdict(self))
         for finding, written in zip(self.findings, known["findings"], strict=True):
             written["wrong"] = finding.wrong
+            del written["lag"]  # which the text has
         return known
 
 

@@ -21,7 +21,7 @@ from rovgraph.live.sources.source import LineDecoder, Notify, Preferred
 from rovgraph.log.stamps import DAY_S
 from rovgraph.log.streams import label_number
 from rovgraph.model.config import Config
-from rovgraph.readers.acoustic_channels import INERTIAL, NO_GRID, Ship, on_ships_grid, positions
+from rovgraph.readers.acoustic_channels import INERTIAL, NO_GRID, Ship, label_of, on_ships_grid, positions
 from rovgraph.readers.acoustic_sentences import (
     AcousticPosition,
     HeadDirections,
@@ -91,7 +91,7 @@ class NmeaDecoder:
         on_earth = *ON_EARTH, "PSIMSSB in degrees"
         self._vehicle = Preferred((*RELATIVE, *on_earth, *INERTIAL, *as_fixes), notify)
         nothing = Config()
-        self._usbl, self._beacon = config.usbl, ""
+        self._usbl, self._stated, self._beacon = config.usbl, config.positioned_beacon, ""
         self._of_ship = config.usbl != nothing.usbl or config.ship != nothing.ship
         self._ship: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)  # time, latitude, longitude
         self._pointing: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # time, heading
@@ -201,8 +201,8 @@ class NmeaDecoder:
 
     def _is_vehicles(self, beacon: str) -> bool:
         """Whether a transponder is the vehicle's: the one that is stated, else the first that is heard."""
-        if self._usbl.beacon is not None:
-            return label_number(str(self._usbl.beacon)) == label_number(beacon)
+        if self._stated is not None:
+            return label_number(self._stated) == label_number(beacon)
         self._beacon = self._beacon or beacon
         return beacon == self._beacon
 
@@ -216,7 +216,7 @@ class NmeaDecoder:
             if there is None:
                 raise Refused("grid", f"{told.kind} is {NO_GRID}")
             lat, lon = there
-        return (Reading(GEODETIC, np.array([lat, lon, *told.noise])),)
+        return (Reading(GEODETIC, np.array([lat, lon, *told.noise, label_of(told.beacon)])),)
 
     def _reply(self, told: Reply, time: float) -> tuple[Reading, ...]:
         """A reply as it was measured, or as a fix."""
@@ -239,7 +239,7 @@ class NmeaDecoder:
             raise Refused("ship", f"{told.name}: the ship's position, or her heading (HDT), is not known")
         why = "filtered by the system" if told.filtered else f"not along the axes of usbl.frame: {self._usbl.frame}"
         self._notify("fixes", f"{told.name} is {why}: it is added to the ship's position, and is a fix", True)
-        return (Reading(GEODETIC, np.array([lat[0], lon[0], told.sd])),)
+        return (Reading(GEODETIC, np.array([lat[0], lon[0], told.sd, math.nan, math.nan, label_of(told.beacon)])),)
 
     def _takes_without_checksum(self, text: str) -> bool:
         """Whether sentences are taken without a checksum: many came, and none had one."""

@@ -327,7 +327,8 @@ export class LiveMap {
     this.drawEllipse(beacon);
     const [x, y] = this.toScreen(beacon.north, beacon.east);
     this.drawSign([[0, -8], [8, 0], [0, 8], [-8, 0]], x, y, 0, palette.paper, palette.ink);
-    this.drawText(beacon.name, x + 6, y - 6, palette.ink);
+    const behind = beacon.behind === null ? "" : beacon.behind > 0 ? `? +${beacon.behind.toFixed(1)}` : "?";
+    this.drawText(beacon.name + behind, x + 6, y - 6, palette.ink);
   }
 
   // A hull that points where the ship heads; a square where that is not known.
