@@ -161,11 +161,11 @@ FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
     "head's depth": (lambda d: d.streams["usbl"], {"usbl": {"lever_arm_m": [8, -2, 13]}}, "zero", "+10.00 m off"),
     "range in feet": (
         lambda d: altered(d.streams["usbl"], usbl_range=lambda t: t["usbl_range"] / 0.3048), {}, "unit",
-        "usbl_range is in feet",
+        "usbl_range is in ft",
     ),
     "place in feet": (
         lambda d: by_place(d.streams["usbl"]).apply(lambda c: c if c.name == "time" else c / 0.3048), {}, "unit",
-        "usbl is in feet",
+        "usbl is in ft",
     ),
     "own depth": (own_depth, {"usbl": {"frame": "ship"}}, "repeats", "that sensor's own"),
     "degrees": (
@@ -466,7 +466,7 @@ def test_a_ship_with_one_position_and_replies_in_no_form_are_counted(command, di
     code, said = command(dive, dive.configuration, ship=dive.streams["ship"].iloc[10:11])
     assert (code, "left out: without a position of the ship" in said) == (0, True)
     code, said = command(dive, dive.configuration, usbl=dive.streams["usbl"].drop(columns="usbl_range"))
-    assert (code, "expected all columns of one of its forms together" in said) == (0, True)
+    assert (code, "usbl_x, usbl_y and usbl_z" in said) == (0, True)
 
 
 @pytest.mark.parametrize("hours", [1.0, -5.5])

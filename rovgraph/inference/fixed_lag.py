@@ -23,7 +23,6 @@ from rovgraph.kernels import assembly as at
 from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.motion_row import GAP
 from rovgraph.log import Measurement
-from rovgraph.model.state import POSE
 from rovgraph.problem.assembly import InsertResult, assembly_of
 from rovgraph.problem.initial_conditions import InitialConditions
 

@@ -42,7 +42,6 @@ from rovgraph.rules import ACOUSTIC_TRACK, BELIEVED_SDS, SURE, USUAL_SHARE, reme
 from rovgraph.sensors.acoustic import in_degrees, is_plumb
 from rovgraph.sensors.instruments import heading_sources, instruments
 from rovgraph.sensors.sensor import SENSORS
-from rovgraph.sensors.sound import FOOT_M
 
 FRAMES = "transducer", "ship", "north"
 MOST = 600  # replies that are compared, evenly
@@ -59,7 +58,6 @@ FASTEST_SHIP_MPS, SHIP_JITTER_M = 15.0, 20.0  # of successive positions of one s
 TWO_SHIPS = 0.1  # of the steps, from which on two ships are in a log
 OPPOSITE = 3.0  # times smaller depth errors with elevations of the other sign
 DEPTH_OFF_M = 1.0
-UNIT_FITS = 0.2  # logarithm of what another unit of the ranges leaves
 GIVEN = 0.25  # of the noise that directions make of a depth: one that is closer to the depth sensor's comes from it
 COARSE_M = 0.05  # noise of depths that are passed on with one digit
 NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
@@ -478,23 +476,27 @@ def _depth_errors(log: Log, config: Config, frame: str | None = None) -> tuple[A
     return (errors[inside], away[inside], seen) if inside.sum() >= MIN_FIXES else None
 
 
-def _in_feet(log: Log, config: Config, errors: Array, seen: Sightings) -> str:
-    """The column or group whose lengths are in feet by far smaller depth errors; "" = neither replies nor depths."""
+def _unit_of_lengths(log: Log, config: Config, errors: Array, seen: Sightings) -> tuple[str, str] | None:
+    """The column or group of lengths, and the unit in which depth errors are far smaller; None = there is none."""
     time, depth = seen.positions.time, log["depth"]
     inside = ~in_gap(time, depth.time, 5.0)
     down = (seen.positions.data[:, 2] - seen.head[:, 2])[inside]
     sensed = np.interp(time[inside], depth.time, depth["depth"])
     by_range = bool(np.isfinite(log["usbl"]["usbl_range"]).any())
     if not by_range and np.isnan(log["usbl"]["usbl_x"]).all():
-        return ""
-    tried = {
-        "usbl_range" if by_range else "usbl": errors - (1.0 - FOOT_M) * down,
-        "depth": errors + (1.0 - FOOT_M) * sensed,
-    }
-    off = {column: float(np.median(np.abs(each))) for column, each in tried.items() if column not in config.units}
-    column = min(off, key=lambda name: off[name], default="")
-    fits = column and OPPOSITE * max(off[column], DEPTH_OFF_M / OPPOSITE) < float(np.median(np.abs(errors)))
-    return column if fits else ""
+        return None
+    off = {}
+    for unit, factor in UNITS["length"].items():
+        tried = {"usbl_range" if by_range else "usbl": errors - (1.0 - factor) * down}
+        if factor > COARSEST_DEPTH:
+            tried["depth"] = errors + (1.0 - factor) * sensed
+        off |= {
+            (name, unit): float(np.median(np.abs(each))) for name, each in tried.items() if name not in config.units
+        }
+    best = min(off, key=lambda one: off[one], default=None)
+    if best is None or OPPOSITE * max(off[best], DEPTH_OFF_M / OPPOSITE) >= float(np.median(np.abs(errors))):
+        return None
+    return best
 
 
 def _elevations_reversed(log: Log, config: Config) -> bool:
@@ -520,11 +522,10 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", f"{text}upwards; state units: {{{_negated(config, column)}}}", "sign")
         return
     off = float(np.median(errors))
-    if column := _in_feet(log, config, errors, seen):
-        text = (
-            f"depths by range and direction are {off:+.1f} m off the depth sensor's: {column} is in feet; state units: "
-        )
-        yield Finding("depth" if column == "depth" else "usbl", "warning", f"{text}{{{column}: ft}}", "unit")
+    if found_unit := _unit_of_lengths(log, config, errors, seen):
+        column, unit = found_unit
+        text = f"depths by range and direction are {off:+.1f} m off the depth sensor's: {column} is in {unit}; state "
+        yield Finding("depth" if column == "depth" else "usbl", "warning", f"{text}units: {{{column}: {unit}}}", "unit")
         return
     noise = 1.4826 * float(np.median(np.abs(errors - off)))
     text = f"depths by range and direction are {off:+.2f} m off the depth sensor's (noise {noise:.2f} m)"
@@ -536,10 +537,7 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         priors["usbl_arm"].sd,
     )
     sd = 1.2533 * noise * math.sqrt(inflation((errors - off).astype(np.complex128)) / len(errors))
-    unit = _unit_of_ranges(seen, errors)
-    if unit is not None:
-        yield Finding("usbl", "warning", f"{text}: state units: {{{unit}}}", "unit")
-    elif abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
+    if abs(off) > max(DEPTH_OFF_M, BELIEVED_SDS * math.hypot(*parts)) + SURE * sd:
         x, y, z = config.usbl.lever_arm_m
         text += f": check the head's depth below the waterline, usbl.lever_arm_m: [{x:g}, {y:g}, {z - off:.1f}] would "
         yield Finding("usbl", "warning", f"{text}mend it, and the elevation and the sound speed", "zero")
@@ -548,16 +546,6 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("usbl", "warning", text, "repeats")
     else:
         yield Finding("usbl", "ok", text)
-
-
-def _unit_of_ranges(seen: Sightings, errors: Array) -> str | None:
-    """The unit of ranges, as ``units`` states it, that makes depths below the head those of the depth sensor."""
-    below = float(np.median(seen.positions.data[:, 2] - seen.head[:, 2]))
-    ratio = below / (below - float(np.median(errors))) if below != np.median(errors) else 0.0
-    if ratio <= 0.0 or abs(math.log(ratio)) < math.log(2.0):
-        return None
-    near = (u for u, factor in UNITS["length"].items() if u != "m" and abs(math.log(ratio * factor)) < UNIT_FITS)
-    return next((f"usbl_range: {unit}" for unit in near), None)
 
 
 def _is_given(log: Log, config: Config, seen: Sightings) -> bool:
