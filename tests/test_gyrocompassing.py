@@ -223,11 +223,11 @@ def test_smooth_takes_a_log_without_heading_or_refuses_it_in_one_line(tmp_path, 
 def test_headings_are_as_honest_as_their_sds_at_a_moving_dock():
     """By the independent simulator; the tightest and the widest of a hundred campaigns are outside the band."""
     from fault_campaign.judge import Result
-    from gyrocompassing import MOMENTS, Setting, honest, make_dive, nees_at
+    from geodesy import MOMENTS, Alignment, honest_headings, nees_at, without_compass
 
     results = []
     for seed in range(12):
-        made = make_dive(Setting("FOG, quartz accelerometers"), seed)
+        made = without_compass(Alignment("FOG, quartz accelerometers"), seed)
         found = {}
         for estimate in smooth(*campaign_log(made)).estimates[:2]:
             track = estimate.trajectory
@@ -239,4 +239,4 @@ def test_headings_are_as_honest_as_their_sds_at_a_moving_dock():
         results.append(Result(found=found))
     low, high = chi2.ppf([0.005, 0.995], 12) / 12
     assert low < nees_at(results, "smoothed", MOMENTS[-1]) < high
-    assert honest(0.7, results)[1]
+    assert honest_headings(0.7, results)[1]
