@@ -156,6 +156,7 @@ def test_a_goal_for_the_heading_needs_a_gyro_that_shows_it():
     [
         ({"environment": {"latitude_deg": None}}, "state environment.latitude_deg, and it may"),
         ({"imu": {"gyr_bias_sd_dps": 0.2}}, "its bias (imu.gyr_bias_sd_dps 0.2) hides the Earth's rate"),
+        ({"environment": {"earth_rotation": False}}, "environment.earth_rotation: false leaves out the rate"),
         ({"environment": {"latitude_deg": 89.9}}, "it errs by 90 deg at latitude 89.9"),
         ({"imu": {"gyr_bias_sd_dps": 1.0 / 3600}, "environment": {"latitude_deg": 80}}, "it errs by 22 deg"),
     ],

@@ -64,6 +64,8 @@ def why_not(config: Config, origin: tuple[float, float] | None) -> str:
     imu, latitude = config.imu, _latitude(config, origin)
     if has_constant_velocity(config):
         return "no IMU is used"
+    if config.environment.earth_rotation is False:
+        return "environment.earth_rotation: false leaves out the rate that shows it"
     if np.deg2rad(imu.gyr_bias_sd_dps) > WORST_SD * EARTH_RATE:
         return f"its bias (imu.gyr_bias_sd_dps {imu.gyr_bias_sd_dps:g}) hides the Earth's rate, 0.0042 deg/s"
     if latitude is None:
