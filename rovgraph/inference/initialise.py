@@ -504,6 +504,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     assumptions += [why_not] if why_not else []
     layers, config = _resolve_layers(log, config, expected, assumptions)
     config = _resolve_norths(log, config, assumptions)
+    assumptions += _grid_of_results(log, config)
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     config = _resolve_waves(log, config, assumptions)
@@ -725,6 +726,21 @@ def with_convergence(log: Log, config: Config, assumptions: list[str]) -> Config
     found = float(convergence_and_scale(env.grid, *np.array(log.origin))[0])
     assumptions.append(f"environment.convergence_deg {found:.3f}, of {env.grid} at the origin")
     return config.model_copy(update={"environment": env.model_copy(update={"convergence_deg": found})})
+
+
+def _grid_of_results(log: Log, config: Config) -> list[str]:
+    """What the grid of the results is like at the origin, a line; none without a grid or a place.
+
+    Raises
+    ------
+    InputError : no such grid; it does not reach there
+    """
+    grid = config.environment.grid
+    if grid is None or log.origin is None:
+        return []
+    north, scale = (float(x) for x in convergence_and_scale(grid, *np.array(log.origin)))
+    turned_by = f"its north is {north:+.3f} deg from true north at the origin"
+    return [f"results are in {grid}, too: {turned_by}, where a metre is {scale:.5f} m of the grid"]
 
 
 def _gravity(log: Log, config: Config, env: Environment, assumptions: list[str]) -> float:
