@@ -87,6 +87,11 @@ def band(dives: int, freedom: int = 1) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def trusted(results: Sequence[Result]) -> str:
+    """How many dives are, smoothed."""
+    return f"{sum(r.verdicts.get('smooth') == 'trusted' for r in results)} of {len(results)} trusted"
+
+
 def metres_apart(lat: Array, lon: Array, true_lat: Array, true_lon: Array) -> Array:
     """Horizontal distances [m] of places [deg] that are close to each other."""
     M, N = earth.radii(np.deg2rad(true_lat))
@@ -332,6 +337,7 @@ class Alignment:
     latitude : [deg]
     turns : of 180 deg, one in the middle and one after three quarters
     speed : along the heading from the first sample on [m/s]; else the vehicle is at a dock that moves
+    bias : of the gyro's horizontal axes, beyond what is stated [deg/h]
     config : beside what a careful crew states
     """
 
@@ -339,6 +345,7 @@ class Alignment:
     latitude: float = 60.0
     turns: int = 0
     speed: float = 0.0
+    bias: float = 0.0
     config: dict[str, Any] | None = None
 
 
@@ -366,7 +373,8 @@ def moving(setting: Alignment, rng: np.random.Generator) -> Motion:
 def without_compass(setting: Alignment, seed: int) -> Dive:
     """A dive without heading sensor."""
     rng = np.random.default_rng([44, seed])
-    unit = replace(UNITS[setting.unit], rate=50.0)
+    bias = np.deg2rad(np.array([setting.bias, setting.bias, 0.0]) / 3600.0)
+    unit = replace(UNITS[setting.unit], rate=50.0, gyr_bias=bias)
     vehicle = Vehicle(unit, ("depth",), Dvl(rate=2.0, yaw_sd=1.0), depth=Depth(rate=1.0))
     motion = moving(setting, rng)
     streams, hidden = sample(motion, vehicle, rng)
@@ -413,7 +421,7 @@ def honest_headings(wanted: float, results: Sequence[Result]) -> tuple[str, bool
         shown = (f"{rms(results, f'{kind} {t:g}'):.2f} ({rms(results, f'{kind} {t:g} sd'):.2f})" for t in SHOWN)
         cells.append(f"{kind} {', '.join(shown)} deg, NEES {min(nees):.2f} to {max(nees):.2f}")
         met &= max(nees) <= high and rms(results, f"{kind} 595") <= wanted
-    return "; ".join(cells) + f" (band {low:.2f} to {high:.2f})", met
+    return "; ".join(cells) + f"; {trusted(results)} (band {low:.2f} to {high:.2f})", met
 
 
 ALIGNMENTS: dict[str, tuple[float, Alignment]] = {
@@ -425,6 +433,9 @@ ALIGNMENTS: dict[str, tuple[float, Alignment]] = {
     "under way at 1.5 m/s, FOG, two half turns": (0.5, Alignment("FOG", turns=2, speed=1.5, config=ON_EARTH)),
     "dock, tactical": (15.0, Alignment("tactical")),
     "dock, tactical, two half turns": (1.5, Alignment("tactical", turns=2)),
+    "dock, FOG, bias of 10 sd": (0.5, Alignment("FOG", bias=0.5)),
+    "dock, FOG, bias of 10 sd, two half turns": (0.5, Alignment("FOG", turns=2, bias=0.5)),
+    "dock, FOG, latitude -60 stated": (0.5, Alignment("FOG", config={"environment": {"latitude_deg": -60.0}})),
 }
 DRAWN = ("dock, FOG", "dock, tactical, two half turns")
 SEEDS_DRAWN = 6
@@ -561,8 +572,7 @@ def honest_depths(part: str, results: Sequence[Result]) -> tuple[str, bool]:
         there = f", {part} {rms(results, f'{kind} {part}'):.3f}" if part else ""
         cells.append(f"{kind} {rms(results, kind):.3f} ({rms(results, f'{kind} sd'):.3f}) m{there}, NEES {nees:.2f}")
         met &= low <= nees <= high
-    trusted = sum(r.verdicts["smooth"] == "trusted" for r in results)
-    return "; ".join(cells) + f"; {trusted} of {len(results)} trusted (band {low:.2f} to {high:.2f})", met
+    return "; ".join(cells) + f"; {trusted(results)} (band {low:.2f} to {high:.2f})", met
 
 
 LONG = ((120.0, 15.0), (2000.0, 3.0), (3500.0, -6.0), (5190.0, -12.0), (5460.0, 15.0), (8000.0, 3.0), (10_500.0, -18.0))

@@ -168,6 +168,16 @@ def test_a_gyro_that_cannot_is_refused_in_one_line(sections, said):
     assert "\n" not in str(refused.value) and "give start.heading_deg" in str(refused.value)
 
 
+def test_a_latitude_that_the_fixes_contradict_is_refused_and_one_that_nothing_checks_is_named():
+    _, log = dive()
+    south = changed(FOG, environment={"latitude_deg": -60.0})
+    with pytest.raises(InputError, match=r"environment\.latitude_deg -60 contradicts the log's 60\.0"):
+        initialise(replace(log, origin=(60.0, 5.0)), south)
+    assert any("at latitude -60, which nothing checks" in line for line in initialise(log, south).assumptions)
+    known = initialise(replace(log, origin=(60.0, 5.0)), FOG)
+    assert not any("its sign neither" in line for line in known.assumptions)
+
+
 def test_a_compass_that_is_left_out_is_named_and_a_short_log_refused():
     case, log = dive(seconds=60.0)
     with pytest.raises(InputError, match="the gyro shows it in 120 s without a gap, and the IMU has 60 s"):
