@@ -82,7 +82,8 @@ def test_a_grids_places_that_are_called_north_and_east_are_told() -> None:
 
 @pytest.fixture(scope="module")
 def case() -> Simulated:
-    config = falcon(heading={"sources": ["ahrs"]}, calibration={"ahrs_offset": {"sd_deg": 0.2}})
+    known = {"ahrs_offset": {"sd_deg": 0.2}, "dvl_yaw": {"sd_deg": 0.2}}
+    config = falcon(heading={"sources": ["ahrs"]}, calibration=known)
     return simulated(
         config,
         200.0,
@@ -119,6 +120,8 @@ def test_a_heading_of_a_grid_is_named_by_its_convergence(
     assert len(found) == 1
     assert said in found[0].text if said else "convergence" not in found[0].text
     assert found[0].level == ("warning" if said else "ok")
+    mounted = changed(config, calibration={"dvl_yaw": {"sd_deg": 3.0}})  # which may turn the track as well
+    assert all(finding.level == "ok" for finding in track(log, with_convergence(log, mounted, [])))
 
 
 def test_a_place_of_a_grid_online_is_one_on_earth() -> None:
