@@ -22,7 +22,7 @@ Notation
 ``v_n`` velocity over ground, both in n. Angles are radians, everything else SI.
 Degrees occur only in configuration keys that end in ``_deg`` and in what a person reads.
 Roll, pitch, yaw are the ZYX convention, ``R_nb = Rz(yaw) Ry(pitch) Rx(roll)``.
-Heading is clockwise from north; depth is positive down.
+Heading is clockwise from north; depth is positive down, from the water's surface of the moment.
 ``*_sd`` is one standard deviation.
 
 Tangent space

@@ -557,12 +557,13 @@ def test_a_pressure_in_the_wrong_unit_is_named_by_the_dvls_way(sound):
     assert "if it is in bar, state units: {pressure: bar}" in messages(log, config, sensor="depth")
 
 
-def test_a_depth_that_begins_and_ends_with_the_airs_weight_is_named(sound):
+@pytest.mark.parametrize(("unit", "hpa"), [("dbar", 100.0), ("psi", 68.94757), ("kPa", 10.0), ("hPa", 1.0)])
+def test_a_depth_that_begins_and_ends_with_the_airs_weight_is_named_without_a_dvl_too(sound, unit, hpa):
     def dive_from_the_surface(data, time):
-        data[:, 0] = 10.13 + 2.0 * np.clip(np.minimum(time - 20.0, 380.0 - time) / 20.0, 0.0, 2.0)
+        data[:, 0] = (1013.0 + 200.0 * np.clip(np.minimum(time - 20.0, 380.0 - time) / 20.0, 0.0, 2.0)) / hpa
 
-    absolute = changed(sound, "depth", dive_from_the_surface)
-    assert "state units: {pressure: dbar}" in messages(absolute, sensor="depth")
+    absolute = changed(without(sound, "dvl"), "depth", dive_from_the_surface)
+    assert f"state units: {{pressure: {unit}}}" in messages(absolute, sensor="depth")
     stated = Config().changed(depth={"surface_hpa": 0})
     assert "remove depth.surface_hpa: 0" in messages(absolute, stated, sensor="depth")
 

@@ -13,13 +13,13 @@ from ruamel.yaml import YAML
 
 from rovgraph.diagnosis.check import Finding, bridge_jumps, examine
 from rovgraph.diagnosis.check.acceleration import ORIENTATIONS
-from rovgraph.diagnosis.check.agreement import heading_lag
+from rovgraph.diagnosis.check.agreement import heading_lag, vertical
 from rovgraph.diagnosis.check.inertial import inertial_motion
 from rovgraph.errors import DataWarning
 from rovgraph.geometry import matrix_from_rpy, rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.model.config import Config, mount_matrix
-from rovgraph.simulate import CALM, Style
+from rovgraph.simulate import CALM, Path, Style
 
 LEVEL = Style(waves=CALM)
 
@@ -411,3 +411,16 @@ def test_a_depth_above_the_surface_is_named(dive):
     data = log["depth"].data.copy()
     data[: len(data) // 20] -= 8.3 + data.min()
     assert "above the surface" in said(altered(log, "depth", data), config, "depth")
+
+
+def test_depth_and_dvl_at_both_ends_of_a_vehicle_that_pitches_agree() -> None:
+    """A vehicle that climbs along its axis as it pitches; taken for one place, its ends seem to have two clocks."""
+    t, pitch = np.arange(0.0, 300.05, 0.1), 0.05 * np.sin(2.0 * np.pi * np.arange(0.0, 300.05, 0.1) / 8.0)
+    forward, down = 0.4 * t, 5.0 + np.cumsum(-0.4 * 0.1 * np.sin(pitch)) + 3.0 * np.sin(2.0 * np.pi * t / 150.0)
+    path = Path.through(t, np.column_stack([forward, 0.0 * t, down]), np.column_stack([0.0 * t, pitch, 0.0 * t]))
+    apart = falcon(dvl={"lever_arm_m": [0.4, 0.0, 0.3]}, depth={"lever_arm_m": [-0.4, 0.0, 0.0]})
+    log = simulated(apart, path=path, noise=False, imu_rate=25.0, dvl_rate=1.0, depth_rate=2.0).log
+    one_place = changed(apart, dvl={"lever_arm_m": [0.0] * 3}, depth={"lever_arm_m": [0.0] * 3})
+    doubts, taken_for_one = ([f.text for f in vertical(log, of) if f.level != "ok"] for of in (apart, one_place))
+    assert not doubts
+    assert any("the clocks disagree" in text for text in taken_for_one)

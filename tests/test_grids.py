@@ -1,6 +1,7 @@
 """Map grids: fixes in northing and easting, and headings relative to grid north."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -81,7 +82,8 @@ def test_a_grids_places_that_are_called_north_and_east_are_told() -> None:
 
 @pytest.fixture(scope="module")
 def case() -> Simulated:
-    config = falcon(heading={"sources": ["ahrs"]}, calibration={"ahrs_offset": {"sd_deg": 0.2}})
+    known = {"ahrs_offset": {"sd_deg": 0.2}, "dvl_yaw": {"sd_deg": 0.2}}
+    config = falcon(heading={"sources": ["ahrs"]}, calibration=known)
     return simulated(
         config,
         200.0,
@@ -120,6 +122,8 @@ def test_a_heading_of_a_grid_is_named_by_its_convergence(
     assert len(found) == 1
     assert said in found[0].text if said else "convergence" not in found[0].text
     assert found[0].level == ("warning" if said else "ok")
+    mounted = changed(config, calibration={"dvl_yaw": {"sd_deg": 3.0}})  # which may turn the track as well
+    assert all(finding.level == "ok" for finding in track(log, with_convergence(log, mounted, [])))
 
 
 def test_a_place_of_a_grid_online_is_one_on_earth() -> None:
@@ -132,3 +136,29 @@ def test_a_place_of_a_grid_online_is_one_on_earth() -> None:
     np.testing.assert_allclose(place[:2], [row["lat"], row["lon"]], atol=1e-9)
     assert [*json_lines("-", heard, Config()).feed(Chunk(line + b"\n", 0.0))] == []
     assert heard.kinds == {"no grid": 1}
+
+
+def test_results_are_in_the_grid_that_is_stated(case: Simulated, tmp_path: Path) -> None:
+    """Places as PROJ has them, and north of the grid and its scale by two points of it."""
+    place = {"origin_lat_deg": ORIGIN[0], "origin_lon_deg": ORIGIN[1], "grid": GRID}
+    config = changed(case.config, environment=place)
+    result = rg.smooth(Log.from_frame(case.dive.log_frame, config), config)
+    assert any("results are in EPSG:32631, too: its north is +2.16" in line for line in result.assumptions)
+    result.save(tmp_path / "out", figures=False, page=False)
+    track = pd.read_csv(tmp_path / "out" / "trajectory_smoothed.csv")
+    to_grid = pyproj.Transformer.from_crs("EPSG:4326", GRID, always_xy=True)
+    x, y = to_grid.transform(track["lon"].to_numpy(), track["lat"].to_numpy())
+    np.testing.assert_allclose(track[["easting", "northing"]], np.column_stack([x, y]), atol=2e-4)
+    lat, lon = float(track["lat"][0]), float(track["lon"][0])
+    north = np.diff(to_grid.transform([lon, lon], [lat - 1e-4, lat + 1e-4]), axis=1)[:, 0]
+    metres = pyproj.Geod(ellps="WGS84").inv(lon, lat - 1e-4, lon, lat + 1e-4)[2]
+    assert track["grid_north"][0] == pytest.approx(-np.rad2deg(np.arctan2(*north)), abs=2e-4)
+    assert track["grid_scale"][0] == pytest.approx(np.hypot(*north) / metres, abs=1e-7)
+    assert len(rg.read_trajectory(tmp_path / "out" / "trajectory_smoothed.csv")) == len(track)
+
+
+def test_a_grid_that_does_not_reach_to_a_dive_is_refused_before_it(case: Simulated) -> None:
+    place = {"origin_lat_deg": ORIGIN[0], "origin_lon_deg": ORIGIN[1], "grid": "EPSG:99999"}
+    config = changed(case.config, environment=place)
+    with pytest.raises(InputError, match=r"environment\.grid 'EPSG:99999': is not known"):
+        rg.smooth(Log.from_frame(case.dive.log_frame, config), config)

@@ -156,6 +156,7 @@ def test_a_goal_for_the_heading_needs_a_gyro_that_shows_it():
     [
         ({"environment": {"latitude_deg": None}}, "state environment.latitude_deg, and it may"),
         ({"imu": {"gyr_bias_sd_dps": 0.2}}, "its bias (imu.gyr_bias_sd_dps 0.2) hides the Earth's rate"),
+        ({"environment": {"earth_rotation": False}}, "environment.earth_rotation: false leaves out the rate"),
         ({"environment": {"latitude_deg": 89.9}}, "it errs by 90 deg at latitude 89.9"),
         ({"imu": {"gyr_bias_sd_dps": 1.0 / 3600}, "environment": {"latitude_deg": 80}}, "it errs by 22 deg"),
     ],
@@ -165,6 +166,16 @@ def test_a_gyro_that_cannot_is_refused_in_one_line(sections, said):
     with pytest.raises(InputError, match=re.escape(said)) as refused:
         initialise(log, changed(FOG, **sections))
     assert "\n" not in str(refused.value) and "give start.heading_deg" in str(refused.value)
+
+
+def test_a_latitude_that_the_fixes_contradict_is_refused_and_one_that_nothing_checks_is_named():
+    _, log = dive()
+    south = changed(FOG, environment={"latitude_deg": -60.0})
+    with pytest.raises(InputError, match=r"environment\.latitude_deg -60 contradicts the log's 60\.0"):
+        initialise(replace(log, origin=(60.0, 5.0)), south)
+    assert any("at latitude -60, which nothing checks" in line for line in initialise(log, south).assumptions)
+    known = initialise(replace(log, origin=(60.0, 5.0)), FOG)
+    assert not any("its sign neither" in line for line in known.assumptions)
 
 
 def test_a_compass_that_is_left_out_is_named_and_a_short_log_refused():
@@ -223,11 +234,11 @@ def test_smooth_takes_a_log_without_heading_or_refuses_it_in_one_line(tmp_path, 
 def test_headings_are_as_honest_as_their_sds_at_a_moving_dock():
     """By the independent simulator; the tightest and the widest of a hundred campaigns are outside the band."""
     from fault_campaign.judge import Result
-    from gyrocompassing import MOMENTS, Setting, honest, make_dive, nees_at
+    from geodesy import MOMENTS, Alignment, honest_headings, nees_at, without_compass
 
     results = []
     for seed in range(12):
-        made = make_dive(Setting("FOG, quartz accelerometers"), seed)
+        made = without_compass(Alignment("FOG, quartz accelerometers"), seed)
         found = {}
         for estimate in smooth(*campaign_log(made)).estimates[:2]:
             track = estimate.trajectory
@@ -239,4 +250,4 @@ def test_headings_are_as_honest_as_their_sds_at_a_moving_dock():
         results.append(Result(found=found))
     low, high = chi2.ppf([0.005, 0.995], 12) / 12
     assert low < nees_at(results, "smoothed", MOMENTS[-1]) < high
-    assert honest(0.7, results)[1]
+    assert honest_headings(0.7, results)[1]

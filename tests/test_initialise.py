@@ -70,6 +70,21 @@ def test_gravity_is_read_through_the_mounting_of_the_imu():
     assert abs(start_of(turned, config)[0][0]) > 170.0  # the wrong mounting is upside down
 
 
+@pytest.mark.parametrize(("bias_sd_dps", "shown"), [(0.2, True), (3e-4, False), (1.4e-5, False)])
+def test_a_gyro_at_rest_reads_the_earths_rate_and_a_good_one_no_bias(bias_sd_dps, shown):
+    """At latitude 60, heading east; what a good gyro reads in five seconds is the Earth, and no motion."""
+    earth = 7.292115e-5 * np.array([0.0, -0.5, -np.sqrt(0.75)])
+    config = parse_config(f"""
+        environment: {{latitude_deg: 60, earth_rotation: true}}
+        imu: {{gyr_bias_sd_dps: {bias_sd_dps}, noise: {{gyr: 3.5e-6}}}}""")
+    rpy, b = start_of(still((0.0, 0.0, 0.0), heading_deg=90.0, gyr=earth), config)
+    assert rpy[2] == pytest.approx(90.0, abs=0.1)
+    assert not any("in motion" in line for line in b.assumptions)
+    np.testing.assert_allclose(b.prior.rpy_sd[:2], Config().start.tilt_sd_deg * DEG)
+    np.testing.assert_allclose(b.prior.state.bias[0, 3:], 0.0, atol=1e-9)
+    assert any("gyro bias from the first" in line for line in b.assumptions) == shown
+
+
 def in_motion(seed=4):
     """A dive that is cut out of another: under way from its first second."""
     case = simulated(falcon(), 120.0, seed=seed, style=LIVELY)

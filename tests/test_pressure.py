@@ -70,6 +70,20 @@ def test_waves_do_not_move_the_surface() -> None:
     assert abs(found[-1] - AIR) < 100.0  # 1 cm
 
 
+def test_a_sea_at_the_start_is_no_air_pressure_and_a_stop_under_water_no_sea() -> None:
+    """Waves of 0.1 m, 30 hPa from the lowest to the highest; and a vehicle that stops at 0.3 m at once."""
+    rng = np.random.default_rng(5)
+    for period in (3.0, 5.3, 7.0):
+        surface = SurfacePressure(None)
+        swell = 1400.0 * np.sin(2.0 * np.pi * TIME / period + 1.0) + rng.normal(0.0, 100.0, len(TIME))
+        found = [surface.take(t, p) for t, p in zip(TIME[:120], AIR + swell, strict=False)]
+        assert abs(found[-1] - AIR) < 350.0  # 3.5 cm
+    surface = SurfacePressure(None)
+    stopped = AIR + 3000.0 * np.clip(TIME / 5.0, 0.0, 1.0)
+    found = [surface.take(t, p) for t, p in zip(TIME, stopped, strict=True)]
+    assert abs(found[-1] - AIR) < 350.0
+
+
 def test_the_online_mode_has_the_depths_of_the_log() -> None:
     rng = np.random.default_rng(2)
     _, pressure = dive(air=AIR + np.where(TIME > 300.0, 400.0, 0.0))

@@ -25,6 +25,7 @@ from rovgraph.geometry import EARTH_RATE, Array, cross, earth_rate_n, rotate, sl
 from rovgraph.kernels.motion import LONGEST_BRIDGED_S
 from rovgraph.log import Log
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.config_sections import SAME_LATITUDE_DEG
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors.instruments import HEADING_STREAMS
 
@@ -64,6 +65,10 @@ def why_not(config: Config, origin: tuple[float, float] | None) -> str:
     imu, latitude = config.imu, _latitude(config, origin)
     if has_constant_velocity(config):
         return "no IMU is used"
+    if config.environment.earth_rotation is False:
+        return "environment.earth_rotation: false leaves out the rate that shows it"
+    if origin is not None and abs((latitude or 0.0) - origin[0]) > SAME_LATITUDE_DEG:
+        return f"environment.latitude_deg {latitude:g} contradicts the log's {origin[0]:.4f}"
     if np.deg2rad(imu.gyr_bias_sd_dps) > WORST_SD * EARTH_RATE:
         return f"its bias (imu.gyr_bias_sd_dps {imu.gyr_bias_sd_dps:g}) hides the Earth's rate, 0.0042 deg/s"
     if latitude is None:
@@ -87,9 +92,10 @@ def without_turns(config: Config, origin: tuple[float, float] | None) -> str:
     """How well the gyro shows the heading of a vehicle that does not turn; arguments as of `why_not`."""
     latitude = _latitude(config, origin) or 0.0
     at_best = np.rad2deg(heading_sd(config, latitude, np.inf))
+    unchecked = ", which nothing checks in minutes, its sign neither" if origin is None else ""
     return (
-        f"to {at_best:.2g} deg at best at latitude {latitude:.4g}, by imu.gyr_bias_sd_dps; half a turn separates the "
-        "gyro's bias from the heading, and leaves its noise"
+        f"to {at_best:.2g} deg at best at latitude {latitude:.4g}{unchecked}, by imu.gyr_bias_sd_dps, which nothing "
+        "checks without turns; half a turn separates the gyro's bias from the heading, and leaves its noise"
     )
 
 

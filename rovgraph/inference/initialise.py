@@ -17,6 +17,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import (
+    EARTH_RATE,
     Array,
     earth_rate_n,
     exp_rotation,
@@ -157,17 +158,14 @@ class Level(NamedTuple):
     force_b, rate_b : ndarray, shape (3,), mean specific force in the axes of the first sample, mean rate
     quiet : whether it stands still
     seconds : that there are
+    shows_bias : whether the mean rate is the gyro's bias: that of a better gyro is the Earth's
     """
 
     force_b: Array
     rate_b: Array
     quiet: bool
     seconds: float
-
-    @property
-    def shows_bias(self) -> bool:
-        """Whether the mean rate is the gyro's bias."""
-        return self.quiet and self.seconds >= 1.0
+    shows_bias: bool = False
 
 
 def level(log: Log, config: Config) -> Level:
@@ -185,14 +183,14 @@ def level(log: Log, config: Config) -> Level:
     if len(time) < 3:
         return Level(acc.mean(axis=0), gyr.mean(axis=0), False, seconds)
     rate = (len(time) - 1) / seconds
-    noise = config.imu.noise
+    noise, bias_sd = config.imu.noise, np.deg2rad(config.imu.gyr_bias_sd_dps)
     quiet = bool(
         (acc.std(axis=0) < QUIET_ACC + 2.0 * noise.acc * np.sqrt(rate)).all()
         and (gyr.std(axis=0) < QUIET_GYR + 2.0 * noise.gyr * np.sqrt(rate)).all()
-        and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * np.deg2rad(config.imu.gyr_bias_sd_dps)
+        and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * bias_sd + EARTH_RATE
     )
     if quiet and not _moves(log):
-        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds)
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds, seconds >= 1.0 and bool(bias_sd > EARTH_RATE))
     return Level(rotate(turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
 
 

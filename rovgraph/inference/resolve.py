@@ -318,6 +318,20 @@ def _no_better_than(config: Config, sources: Sequence[str], sd_deg: float) -> di
     return entries
 
 
+def _grid_of_results(dive: Resolution) -> None:
+    """What the grid of the results is like at the origin.
+
+    Raises
+    ------
+    InputError : no such grid; it does not reach there
+    """
+    grid = dive.config.environment.grid
+    if grid is not None and dive.log.origin is not None:
+        north, scale = (float(x) for x in convergence_and_scale(grid, *np.array(dive.log.origin)))
+        turned_by = f"its north is {north:+.3f} deg from true north at the origin"
+        dive.assume(f"results are in {grid}, too: {turned_by}, where a metre is {scale:.5f} m of the grid")
+
+
 def _magnetometer(dive: Resolution) -> None:
     """Magnitude and dip of the field, by the log where place and date do not give them."""
     env = dive.config.environment
@@ -507,6 +521,7 @@ PASSES: tuple[Callable[[Resolution], None], ...] = (
     _layers,
     _thrusters,
     _norths,
+    _grid_of_results,
     _magnetometer,
     _frame,
     _gravity,

@@ -2,8 +2,9 @@
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
 v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
-Unix time, ``lat, lon`` if the origin of n on Earth is known, and what else is known at its epochs. TUM files
-hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
+Unix time, ``lat, lon`` if the origin of n on Earth is known, with a map grid ``easting, northing, grid_north,
+grid_scale``, and what else is known at its epochs. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as
+``evo_ape``.
 """
 
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ from rovgraph.geometry import (
 )
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
+from rovgraph.model.grids import grid_columns
 from rovgraph.model.origin import Origin, lat_lon
 
 if TYPE_CHECKING:
@@ -255,6 +257,7 @@ class Trajectory:
         origin: Origin | None = None,
         unix: bool | None = None,
         also: Mapping[str, Array] | None = None,
+        grid: str | None = None,
     ) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
@@ -265,6 +268,7 @@ class Trajectory:
         origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
         unix : whether there is a column ``unix_time``, empty for other times; None = if the time is Unix time
         also : further columns, such as the bottom under the track, ndarray, shape (n,); NaN is an empty cell
+        grid : of `rovgraph.model.grids.grid_columns`, for its columns too where the origin is known; None = without
         """
         rounded = {name: np.round(own, 12) + 0.0 for name, own in self.columns().items()}  # no -0
         known = {name: own for name, own in rounded.items() if not np.isnan(own).all()}
@@ -278,6 +282,9 @@ class Trajectory:
         if origin is not None:
             known["lat"], known["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
+            if grid is not None:
+                known |= grid_columns(grid, known["lat"], known["lon"])
+                decimals |= {"easting": 4, "northing": 4, "grid_north": 5, "grid_scale": 8}
         known |= {name: own for name, own in (also or {}).items() if not np.isnan(own).all()}
         write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
 

@@ -543,7 +543,7 @@ class Files:
         """Put a smoothed track on disk, in place of an older one; ``origin`` of `Trajectory.write_csv`."""
         path, partial = self.folder / SMOOTHED, self.folder / f".{SMOOTHED}.partial"
         try:
-            estimate.trajectory.write_csv(partial, origin=origin)
+            estimate.trajectory.write_csv(partial, origin=origin, grid=self.config.environment.grid)
             partial.replace(path)
         except OSError as error:
             self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")

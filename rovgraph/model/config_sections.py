@@ -127,7 +127,7 @@ class Environment(ConfigSection):
         None, description="its change by a kilometre north and east; null = as the declination, by place and date, or 0"
     )
     grid: str | None = Field(
-        None, description="map grid of fix_northing, fix_easting and of grid headings, such as EPSG:32632"
+        None, description="map grid of fix_northing, fix_easting, grid headings and results, such as EPSG:32632"
     )
     convergence_deg: Annotated[float, Field(gt=-180, lt=180)] | None = Field(
         None, description="grid north from true north, east positive; null = of the grid at the origin"

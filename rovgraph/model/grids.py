@@ -9,28 +9,33 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 
+KEY = "environment.grid"
 ELLIPSOID = "EPSG:4326"
 MARGIN_DEG = 6.0  # beyond the area that a grid is made for
 
 
 @cache
-def _system(grid: str) -> tuple[Any, Any]:
-    """The grid, and what takes its places to the ellipsoid."""
+def _system(name: str, key: str) -> Any:
+    """A coordinate system by its name, which was stated as ``key``."""
     try:
         import pyproj
     except ImportError:
-        text = f"environment.grid {grid}: needs pyproj; install it with: pip install 'rovgraph[gis]'"
-        raise InputError(text) from None
+        raise InputError(f"{key} {name}: needs pyproj; install it with: pip install 'rovgraph[gis]'") from None
     try:
-        system = pyproj.CRS.from_user_input(grid)
+        return pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError:
-        raise InputError(f"environment.grid {grid!r}: is not known; give one such as EPSG:32632, UTM zone 32") from None
+        raise InputError(f"{key} {name!r}: is not known; give one such as EPSG:32632, UTM zone 32") from None
+
+
+def _grid(name: str) -> Any:
+    """The system of ``environment.grid``."""
+    system = _system(name, KEY)
     if not system.is_projected:
-        raise InputError(f"environment.grid {grid!r}: is in degrees, no grid; give one such as EPSG:32632, UTM zone 32")
-    return system, pyproj.Transformer.from_crs(system, ELLIPSOID, always_xy=True)
+        raise InputError(f"{KEY} {name!r}: is in degrees, no grid; give one such as EPSG:32632, UTM zone 32")
+    return system
 
 
 def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, Array]:
@@ -40,7 +45,7 @@ def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, 
     ------
     InputError : no such grid; places that it does not have
     """
-    system, transformer = _system(grid)
+    system, transformer = _grid(grid), _transformer(grid, ELLIPSOID)
     known = np.isfinite(easting) & np.isfinite(northing)
     lon, lat = (np.full(len(easting), np.nan) for _ in range(2))
     lon[known], lat[known] = transformer.transform(easting[known], northing[known])
@@ -57,6 +62,61 @@ def lat_lon_of_grid(grid: str, easting: Array, northing: Array) -> tuple[Array, 
     return lat, lon
 
 
+@cache
+def _transformer(source: str, target: str) -> Any:
+    import pyproj
+
+    return pyproj.Transformer.from_crs(source, target, always_xy=True)
+
+
+def projected(lon: Array, lat: Array, crs: str, key: str = "crs") -> tuple[Array, Array]:
+    """Easting and northing in a coordinate system, shape (n,) each; longitude and latitude in one of degrees.
+
+    Parameters
+    ----------
+    lon, lat : ndarray, shape (n,) [deg], WGS 84
+    crs : what pyproj understands, such as "EPSG:25832"
+    key : what it was stated as
+
+    Raises
+    ------
+    InputError : coordinates that are not known, or that do not reach there
+    """
+    system = _system(crs, key)
+    if not (system.is_projected or system.is_geographic):
+        raise InputError(f"{key} {crs!r}: {system.name} is no map's coordinates; give one such as EPSG:25832, or utm")
+    if system.area_of_use is not None and not _within(float(lon[0]), float(lat[0]), *system.area_of_use.bounds):
+        warn(f"{key} {crs!r}: {system.name} is not made for {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
+    x, y = _transformer(ELLIPSOID, crs).transform(lon, lat)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise InputError(f"{key} {crs!r}: does not reach to {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
+    return np.asarray(x), np.asarray(y)
+
+
+def _within(lon: float, lat: float, west: float, south: float, east: float, north: float) -> bool:
+    """Whether an area, which may lie across the date line, holds a place; all in degrees."""
+    return south <= lat <= north and (lon - west) % 360.0 <= ((east - west) % 360.0 or 360.0)
+
+
+def is_projected(crs: str) -> bool:
+    """Whether a coordinate system that is known is a grid, and not in degrees."""
+    return bool(_system(crs, "crs").is_projected)
+
+
+def grid_columns(grid: str, lat: Array, lon: Array) -> dict[str, Array]:
+    """Places of a grid, for tables: ``easting``, ``northing`` [m], ``grid_north`` [deg] and ``grid_scale``.
+
+    The latter two are those of `convergence_and_scale`; all are ndarray, shape (n,).
+
+    Raises
+    ------
+    InputError : no such grid; it does not reach there
+    """
+    easting, northing = projected(lon, lat, grid, KEY)
+    north, scale = convergence_and_scale(grid, lat, lon)
+    return {"easting": easting, "northing": northing, "grid_north": north, "grid_scale": scale}
+
+
 def convergence_and_scale(grid: str, lat: Array, lon: Array) -> tuple[Array, Array]:
     """Where grid north points, clockwise from true north [deg], and metres of the grid for one of the ground.
 
@@ -68,7 +128,7 @@ def convergence_and_scale(grid: str, lat: Array, lon: Array) -> tuple[Array, Arr
     ------
     InputError : no such grid; it does not reach there
     """
-    system, _ = _system(grid)
+    system = _grid(grid)
     import pyproj
 
     try:

@@ -207,7 +207,8 @@ def write_results(
     for estimate in estimates:
         bottom = bottom_of(log, config, estimate)
         under = None if bottom is None else bottom.under(estimate.trajectory)
-        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv", origin=log.origin, also=under)
+        path = folder / f"trajectory_{estimate.kind}.csv"
+        estimate.trajectory.write_csv(path, origin=log.origin, also=under, grid=config.environment.grid)
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}{TUM}")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})

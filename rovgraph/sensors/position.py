@@ -15,7 +15,9 @@ from rovgraph.model.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobia
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Said, Sensor, instrument, own_sd
 
-AIR_DBAR, SAME_AIR_M = (9.5, 10.5), 0.3  # of the air's pressure, and how much it changes in a dive
+AIR_HPA, SAME_AIR_HPA = (950.0, 1050.0), 30.0  # of the air's pressure, and how much it changes in a dive
+PRESSURES = {"dbar": 100.0, "psi": 68.94757, "kPa": 10.0, "hPa": 1.0}  # [hPa]; in bar, air is as a metre is
+HPA_PER_M = 100.5
 DIVED_M = 2.0  # more than waves
 WAVES_REACH_M = 5.0  # over which the waves' pressure falls by e: g T^2 / (4 pi^2), of a period T of 4.5 s
 DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
@@ -126,11 +128,14 @@ def _range(values: Array, config: Config) -> Iterator[Said]:
             "zero",
         )
     ends, least = [float(np.median(some)) for some in (depth[:9], depth[-9:])], float(np.percentile(depth, 1))
-    if all(AIR_DBAR[0] < end < min(AIR_DBAR[1], least + SAME_AIR_M) for end in ends) and np.ptp(depth) > DIVED_M:
-        remedy = "if it is a pressure in dbar, name it pressure and state units: {pressure: dbar}"
-        if config.depth.surface_hpa is not None:
-            remedy = f"if it was at the surface, remove depth.surface_hpa: {config.depth.surface_hpa:g}"
-        yield "warning", f"it begins and ends at {ends[0]:.1f} m, as much as the air weighs; {remedy}", "unit"
+    for unit, hpa in PRESSURES.items():
+        most = min(AIR_HPA[1], least * hpa + SAME_AIR_HPA)
+        if np.ptp(depth) * hpa > DIVED_M * HPA_PER_M and all(AIR_HPA[0] < end * hpa < most for end in ends):
+            remedy = f"if it is a pressure in {unit}, name it pressure and state units: {{pressure: {unit}}}"
+            if config.depth.surface_hpa is not None:
+                remedy = f"if it was at the surface, remove depth.surface_hpa: {config.depth.surface_hpa:g}"
+            yield "warning", f"it begins and ends at {ends[0]:.4g} m, as much as the air weighs; {remedy}", "unit"
+            return
     if np.ptp(depth) > 1000.0:
         yield "warning", f"depth spans {np.ptp(depth):.4g} m; if it is in cm or mm, state units: {{depth: mm}}", "unit"
 

@@ -34,6 +34,7 @@ DEEPER_DBAR = 1000.0  # beyond a profile, whose water stays
 FRESH, BY_SALT = 999.7, 0.778  # at 10 deg C [kg/m^3], and by a psu
 BLOCK_S = 5.0  # of pressures that are looked at together
 CALM_PA = 1500.0  # spread of a block in which the vehicle keeps its depth
+STEADY, HIGHEST_PA = 0.25, 1e4  # of a spread by waves, by which two blocks differ from the two before; the most spread
 SAME_PA = 1000.0  # change of the air's pressure between two stays at the surface: 10 cm of water
 WAVES_S, ENOUGH, BLOCKS = 20.0, 15, 3  # of depths at the surface: length, least samples, least number
 AT_SURFACE_M = 0.5
@@ -52,7 +53,8 @@ class SurfacePressure:
     """Pressure of the air, by what was measured so far: of the newest stay at the surface.
 
     It begins with the least pressure of the first block. A stay begins with a lower one, or where two calm blocks in a
-    row come back to that of the stay before, within `SAME_PA`. It is a mean of medians, so that waves hardly move it.
+    row come back to that of the stay before, within `SAME_PA`. It is a mean of medians, so that waves hardly move it. A
+    block with waves is calm where two in a row have the level of the two before; at the start, it is above the least.
 
     Parameters
     ----------
@@ -68,6 +70,7 @@ class SurfacePressure:
         self._finds = stated is None
         self._block: list[float] = []
         self._begin, self._mean, self._count = 0.0, 0.0, 0
+        self._levels, self._above = [math.nan] * 4, 0.0
         self._first = True
 
     def take(self, time: float, pascal: float) -> float:
@@ -86,28 +89,33 @@ class SurfacePressure:
     def _close(self) -> None:
         low, level, high = np.quantile(self._block, [0.05, 0.5, 0.95]).tolist()
         self._block = []
-        if self._first and high - low > CALM_PA and LEAST <= low <= MOST:
-            self.value = low
-        self._first = False
-        if high - low > CALM_PA or not LEAST <= level <= MOST or level > self.value + SAME_PA:
+        moves, possible = high - low > CALM_PA, LEAST <= level <= MOST
+        if self._first and moves and LEAST <= low <= MOST:
+            self.value, self._above = low, level - low
+        self._first, self._levels = False, [*self._levels[1:], level]
+        a, b, c, d = self._levels
+        waves = moves and high - low <= HIGHEST_PA and abs(c + d - a - b) <= 2.0 * STEADY * (high - low)
+        level = 0.25 * (a + b + c + d) if waves else level
+        if (moves and not waves) or not possible or level > self.value + SAME_PA + waves * self._above:
             self._count = 0
             return
         if not level >= self.value - SAME_PA:  # the first, or nearer to the surface than all before
-            self.value, self._mean, self._count = level, level, 1
+            self.value, self._mean, self._count, self._above = level, level, 1, 0.0
             return
         self._mean = (self._count * self._mean + level) / (self._count + 1)
         self._count += 1
         if self._count > 1:
-            self.value = self._mean
+            self.value, self._above = self._mean, 0.0
 
     def state(self) -> list[Any]:
         """Plain values from which `restore` goes on."""
-        return [self.value, self._begin, self._mean, self._count, self._first, *self._block]
+        settled = self.value, self._begin, self._mean, self._count, self._first, self._above
+        return [*settled, *self._levels, *self._block]
 
     def restore(self, state: list[Any]) -> None:
         """Go on from the state of another."""
-        self.value, self._begin, self._mean, self._count, first, *self._block = state
-        self._first = bool(first)
+        self.value, self._begin, self._mean, self._count, first, self._above, *rest = state
+        self._first, self._levels, self._block = bool(first), rest[:4], rest[4:]
 
 
 class OceanProfile:

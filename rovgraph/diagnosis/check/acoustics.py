@@ -487,12 +487,11 @@ def _unit_of_lengths(log: Log, config: Config, errors: Array, seen: Sightings) -
         return None
     off = {}
     for unit, factor in UNITS["length"].items():
-        tried = {"usbl_range" if by_range else "usbl": errors - (1.0 - factor) * down}
-        if factor > COARSEST_DEPTH:
-            tried["depth"] = errors + (1.0 - factor) * sensed
-        off |= {
-            (name, unit): float(np.median(np.abs(each))) for name, each in tried.items() if name not in config.units
+        tried = {
+            "usbl_range" if by_range else "usbl": errors - (1.0 - factor) * down,
+            "depth": errors + (1.0 - factor) * sensed,
         }
+        off |= {(name, unit): float(np.median(np.abs(e))) for name, e in tried.items() if name not in config.units}
     best = min(off, key=lambda one: off[one], default=None)
     if best is None or OPPOSITE * max(off[best], DEPTH_OFF_M / OPPOSITE) >= float(np.median(np.abs(errors))):
         return None

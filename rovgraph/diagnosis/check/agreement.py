@@ -228,7 +228,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     if len(pings) < MIN_WINDOWS:
         return
     down = downwards(log["imu"], config, pings.time)
-    depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
+    depth, dvl, window = _descents(log, config, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     closely = abs(f.correlation) > CLOSELY
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b if closely else 0.0) < ENOUGH_DIVING:
@@ -292,12 +292,14 @@ def _other_units(slope: float, log: Log, config: Config) -> str:
     return "; ".join(said)
 
 
-def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
-    """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
+def _descents(log: Log, config: Config, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
+    """Depth of the DVL, its way downwards with a mounting, and the window over which the two are compared [s]."""
     way = integral(pings.time, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
     depth, dvl = without_spikes(log["depth"]), Signal(pings.time, way)
-    return _without_steps(Signal(depth.time, depth["depth"]), dvl, window), dvl, window
+    arm_b = np.subtract(config.dvl.lever_arm_m, config.depth.lever_arm_m)
+    there = depth["depth"] + downwards(log["imu"], config, depth.time) @ arm_b
+    return _without_steps(Signal(depth.time, there), dvl, window), dvl, window
 
 
 def _without_steps(depth: Signal, dvl: Signal, window: float) -> Signal:
@@ -314,7 +316,7 @@ def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
     if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
         return 0.0
     pings = valid_pings(log["dvl"])
-    f = fit(*_descents(log, pings, R_bs, downwards(log["imu"], config, pings.time)))
+    f = fit(*_descents(log, config, pings, R_bs, downwards(log["imu"], config, pings.time)))
     return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 

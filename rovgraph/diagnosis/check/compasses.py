@@ -10,6 +10,7 @@ well, the gyro's axes are wrong. Changes over some seconds are compared, with c 
 turns about one axis only, several A fit equally.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -49,7 +50,7 @@ SIMILAR = 1.3  # times the least square, up to which two rotations are not disti
 EVIDENCE = 60.0  # in chi-square
 LEVEL = 0.1  # of the field along the vertical, whose sense shows nothing
 UPSIDE_DOWN = 0.5  # of the field along the vertical in the wrong sense, which no iron makes
-MAGNITUDE, DIP_DEG = 0.2, 8.0  # of the Earth's field, more than what a usable magnetometer is off
+FIELD_SDS, ROCK_NT = 5.0, 250.0  # of what iron does to magnitude and dip, with rock and storms beyond the model
 NORMALISED = 0.7, 1.4  # magnitudes of a field without a unit
 TROPIC_DEG = 20.0  # of latitude, beyond which the dip has its sign
 SAME_HEADING = np.deg2rad(40.0)  # of two compasses, which no offset and no iron exceeds
@@ -85,15 +86,17 @@ def field_of_place(log: Log, config: Config) -> Iterator[Finding]:
         return
     in_unit = [middle] if stated else [middle / size * EARTH_FIELD["uT"] for u, size in EARTH_FIELD.items() if u != "1"]
     seen, wrong = min(in_unit, key=lambda size: abs(np.log(size / total))), []
+    iron = (beliefs(config)[name].sd for name in ("hard_iron", "soft_iron"))
+    limit = FIELD_SDS * math.hypot(*iron, ROCK_NT / field.total_nt)
     if not stated and abs(np.log(seen / total)) > np.log(2.0):
         return  # its unit is not known, which is told already
     said = f"magnitude {seen:.1f} uT where the field is {total:.1f} uT there"
-    if abs(seen / total - 1.0) > MAGNITUDE:
+    if abs(seen / total - 1.0) > limit:
         wrong.append(said)
     if "imu" in log and len(log["imu"]) > 1:
         dip = dip_of_log(log)
         said += f", dip {dip:.1f} deg where it is {field.dip_deg:.1f}"
-        if abs(dip - field.dip_deg) > DIP_DEG:
+        if abs(dip - field.dip_deg) > np.rad2deg(limit):
             wrong.append(f"dip {dip:.0f} deg where the field's is {field.dip_deg:.0f} deg there")
     if wrong:
         cause = "hard or soft iron, or the scale: calibrate it (rovgraph calibrate magnetometer)"

@@ -214,7 +214,7 @@ def heading_believed(config: Config, compasses: Collection[str]) -> float:
 def _of_grid(log: Log, config: Config, sensor: str, line: _Line) -> tuple[str, bool]:
     """What says that a heading is relative to a grid, or was made true twice, by the turn of its track; "" = nothing.
 
-    With it, whether the compass is known so well that nothing else turns the track.
+    With it, whether compass and mounting are known so well that nothing else turns the track.
     """
     if log.origin is None or sensor not in NORTHS:
         return "", False
@@ -233,13 +233,13 @@ def _of_grid(log: Log, config: Config, sensor: str, line: _Line) -> tuple[str, b
         said += f", and was probably taken twice: if {sensor} is true already, state {key}: true"
     else:
         said += f": if {sensor} is relative to grid north, state {key}: grid, and environment.grid: {grid}"
-    prior = beliefs(config)[OFFSETS[sensor]]
-    offset = math.degrees(prior.sd) if prior.estimate or prior.considered else 0.0
-    return said, abs(found) > OF_GRID_SDS * offset
+    priors = (beliefs(config)[name] for name in {OFFSETS[sensor], "dvl_yaw"})
+    others = math.hypot(*(math.degrees(prior.sd) for prior in priors if prior.estimate or prior.considered))
+    return said, abs(found) > OF_GRID_SDS * others
 
 
 NORTHS = {"ahrs": "ahrs", "dvl_heading": "dvl", "vehicle_heading": "vehicle"}
-OF_GRID_SDS, OF_GRID_DEG = 3.0, 0.2  # of a turn that is a convergence: beyond its sd, and from it
+OF_GRID_SDS, OF_GRID_DEG = 4.0, 0.2  # of a turn that is a convergence: beyond its sd, and from it
 
 
 def _contradicted(as_is: _Line) -> Finding:

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.errors import InputError, in_one_line, warn
+from rovgraph.errors import InputError, in_one_line
 from rovgraph.geometry import Array
-from rovgraph.model.grids import convergence_and_scale, utm_zone
+from rovgraph.model.grids import ELLIPSOID, convergence_and_scale, is_projected, projected, utm_zone
 from rovgraph.report.export.formats import ExportFormat, ExportOptions
 from rovgraph.report.export.track import SHOWN_HZ, Track, ellipse, point_table
 
@@ -203,7 +203,6 @@ def write_gpx(track: Track, path: Path, options: ExportOptions) -> None:
 _GPX = (ExportFormat("gpx", "GPX", ".gpx", write_gpx, "maps", needs_place=True),)
 
 
-WGS84 = "EPSG:4326"
 DRIVERS = {"gpkg": "GPKG", "shp": "ESRI Shapefile"}
 LONGEST = 10  # characters of a shapefile's field name
 
@@ -222,8 +221,8 @@ def write_layer(track: Track, path: Path, options: ExportOptions, driver: str) -
 
     sampled = track.at_rate(options.rate_or(SHOWN_HZ))
     table = point_table(sampled)
-    x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
-    if options.crs is not None:  # headings are relative to true north
+    x, y, crs = coordinates(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
+    if options.crs is not None and is_projected(crs):  # headings are relative to true north
         north, scale = convergence_and_scale(crs, table["lat"].to_numpy(), table["lon"].to_numpy())
         table = table.assign(grid_north=north.round(5), grid_scale=scale.round(8))
     points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(sampled.height)])))
@@ -247,44 +246,24 @@ def _field(column: pd.Series) -> Array:
     return column.to_numpy(object if not pd.api.types.is_numeric_dtype(column) else float)
 
 
-def projected(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, str]:
-    """Easting and northing in a coordinate system, and its name.
+def coordinates(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, str]:
+    """Places in the coordinates of an export, and what these are called.
 
     Parameters
     ----------
     lon, lat : ndarray, shape (n,) [deg], WGS 84
-    crs : what pyproj understands, such as "EPSG:25832"; "utm" = the zone of the first point; None = degrees
+    crs : of `projected`; "utm" = the zone of the first point; None = degrees
 
     Raises
     ------
-    InputError : coordinates that are not known
+    InputError : coordinates that are not known, or that do not reach there
     """
     if not isinstance(crs, str | None):
         raise InputError(f"crs {crs!r}: expected text, such as EPSG:25832, or utm")
     if crs is None:
-        return lon, lat, WGS84
-    import pyproj
-
-    if crs.lower() == "utm":
-        crs = utm_zone(float(lat[0]), float(lon[0]))
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-        transform = pyproj.Transformer.from_crs(WGS84, crs, always_xy=True)
-    except pyproj.exceptions.CRSError:
-        raise InputError(f"crs {crs!r}: is not known; give one such as EPSG:25832, or utm") from None
-    if not (system.is_projected or system.is_geographic):
-        raise InputError(f"crs {crs!r}: {system.name} is no map's coordinates; give one such as EPSG:25832, or utm")
-    if system.area_of_use is not None and not _within(float(lon[0]), float(lat[0]), *system.area_of_use.bounds):
-        warn(f"crs {crs!r}: {system.name} is not made for {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
-    x, y = transform.transform(lon, lat)
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise InputError(f"crs {crs!r}: does not reach to {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
-    return np.asarray(x), np.asarray(y), crs
-
-
-def _within(lon: float, lat: float, west: float, south: float, east: float, north: float) -> bool:
-    """Whether an area, which may lie across the date line, holds a place; all in degrees."""
-    return south <= lat <= north and (lon - west) % 360.0 <= ((east - west) % 360.0 or 360.0)
+        return lon, lat, ELLIPSOID
+    name = utm_zone(float(lat[0]), float(lon[0])) if crs.lower() == "utm" else crs
+    return *projected(lon, lat, name), name
 
 
 def write_gpkg(track: Track, path: Path, options: ExportOptions) -> None:

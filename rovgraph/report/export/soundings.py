@@ -7,7 +7,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.report.export.formats import ExportFormat, ExportOptions
-from rovgraph.report.export.maps import projected
+from rovgraph.report.export.maps import coordinates
 from rovgraph.report.export.track import Track
 
 CELL_M = 1.0  # of a grid, by default
@@ -35,7 +35,7 @@ def _mapped(track: Track, crs: str | None) -> tuple[Array, Array, Array, str]:
     """Easting, northing and height of the soundings, and the coordinate system's name."""
     north, east, height = _heights(track)
     lat, lon = track.place(north, east)
-    x, y, name = projected(lon, lat, crs or "utm")
+    x, y, name = coordinates(lon, lat, crs or "utm")
     return x, y, height, name
 
 
