@@ -24,10 +24,11 @@ from scipy.stats import chi2
 
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
-from rovgraph.inference.crossovers import Drift, lines_of, match
+from rovgraph.inference.crossovers import Drift, match
+from rovgraph.inference.relief import lines_of
 
 KNOT_S = 20.0
-WRONG_M = 3.0  # of a tie: what is left of the shift, if it is beyond 99.9 % of what the track's covariance says, too
+WRONG_M = 3.0  # of a crossing: what is left of its shift, if it is beyond 99.9 % of what the track's covariance says, too
 
 
 def path(lines: int = 12, length: float = 500.0, apart: float = 25.0, crosslines: int = 4) -> Array:
@@ -222,7 +223,7 @@ class Outcome:
     before: float
     after: float
     nees: float
-    ties: int
+    used: int
     crossings: int
     wrong: int
     seconds: float
@@ -259,22 +260,21 @@ def survey(case: Case, seed: int) -> Outcome:
         drift, chart = drift.beside(1e-3), charted(rng, terrain, case.chart)
     found = match(lines, drift, chart)
     seconds = time.perf_counter() - begin
-    after = drift.tied(found.ties)
+    after = drift.given(found.closures) if found.closures else drift
     left = e - after.mean[: len(e)]
     nees, wrong = np.nan, 0
-    if found.ties:
+    if found.closures:
         each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(knots)))]
         nees = float(np.mean([x @ np.linalg.solve(C, x) / 2 for x, C in each]))
         off_chart = np.append(left, [0.0, 0.0])
-        pairs = (np.array([tie.knots for tie in found.ties])[:, :, None] * 2 + [0, 1]).transpose(1, 0, 2)
+        pairs = (np.array([c.knots for c in found.closures])[:, :, None] * 2 + [0, 1]).transpose(1, 0, 2)
         off = off_chart[pairs[0]] - off_chart[pairs[1]]
         for x, (a, b) in zip(off, pairs.swapaxes(0, 1), strict=True):
             C = after.P[np.ix_(a, a)] + after.P[np.ix_(b, b)] - after.P[np.ix_(a, b)] - after.P[np.ix_(b, a)]
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))
     rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
-    return Outcome(
-        rms[0], rms[1], nees, len(found.ties), len(found.crossings), wrong, seconds, f"{found.text} {found.relief}"
-    )
+    used, crossings = len(found.closures), len(found.crossings)
+    return Outcome(rms[0], rms[1], nees, used, crossings, wrong, seconds, f"{found.text} {found.relief}")
 
 
 @dataclass
@@ -364,10 +364,10 @@ def main() -> None:
             if given.verbose:
                 print("   ", out[-1], flush=True)
         before, after = (np.sqrt(np.mean([getattr(o, n) ** 2 for o in out])) for n in ("before", "after"))
-        some = [o for o in out if o.ties]
+        some = [o for o in out if o.used]
         print(
             f"| {name} | {before:.1f} | {after:.1f} | {after / before:.2f} | {len(some)} of {len(out)} | "
-            f"{sum(o.ties for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
+            f"{sum(o.used for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
             f"{np.mean([o.nees for o in some]) if some else np.nan:.2f} | "
             f"{np.mean([o.seconds for o in out]):.1f} |",
             flush=True,
