@@ -28,7 +28,9 @@ from rovgraph.inference.crossovers import Drift, match
 from rovgraph.inference.relief import lines_of
 
 KNOT_S = 20.0
-WRONG_M = 3.0  # of a crossing: what is left of its shift, if it is beyond 99.9 % of what the track's covariance says, too
+WRONG_M = (
+    3.0  # of a crossing: what is left of its shift, if it is beyond 99.9 % of what the track's covariance says, too
+)
 
 
 def path(lines: int = 12, length: float = 500.0, apart: float = 25.0, crosslines: int = 4) -> Array:
@@ -257,7 +259,7 @@ def survey(case: Case, seed: int) -> Outcome:
     lines = lines_of(t, heading, estimated, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
     drift, chart = Drift(knots, np.zeros(len(P)), P), None
     if case.chart is not None:
-        drift, chart = drift.beside(1e-3), charted(rng, terrain, case.chart)
+        drift, chart = drift.beside(np.zeros(2), 1e-3), charted(rng, terrain, case.chart)
     found = match(lines, drift, chart)
     seconds = time.perf_counter() - begin
     after = drift.given(found.closures) if found.closures else drift

@@ -92,7 +92,9 @@ def test_two_crossings_are_too_few():
 
 def test_a_loop_closure_corrects_both_ends_by_what_they_are_unsure_of():
     P = np.diag([1.0, 1.0, 3.0, 3.0])
-    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).given([LoopClosure((1, 0), 1e8 * np.eye(2), np.array([2e8, 0.0]))])
+    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).given(
+        [LoopClosure((1, 0), 1e8 * np.eye(2), np.array([2e8, 0.0]))]
+    )
     assert after.mean == pytest.approx([-0.5, 0.0, 1.5, 0.0], abs=1e-6)
     assert np.diag(after.P) == pytest.approx([0.75] * 4, abs=1e-6)
 
@@ -136,7 +138,9 @@ def lost(shift=(6.0, -4.0)):
     """Three lines of a survey whose whole track is off by a shift, which has an sd of 8 m."""
     lines, drift = survey(6, shift=(0.0, 0.0))
     P = 64.0 * np.kron(np.ones((120, 120)), np.eye(2)) + 1e-4 * np.eye(240)
-    return [replace(line, place=line.place - shift) for line in lines[:3]], Drift(drift.time, drift.mean, P).beside(0.1)
+    return [replace(line, place=line.place - shift) for line in lines[:3]], Drift(drift.time, drift.mean, P).beside(
+        np.zeros(2), 0.1
+    )
 
 
 def test_a_chart_shows_where_a_track_is():

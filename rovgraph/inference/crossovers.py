@@ -12,26 +12,25 @@ joint covariance of the track correlates their shifts, each hypothesis is a norm
 crossing splits it into one for every peak of its field, and one in which its soundings are not the bottom's. Used is
 what all hypotheses within `LEAD` of the best agree about.
 
-What a field says of a shift, beside the track and the other crossings, is found from moments about its peak (expectation
-propagation, Minka 2001), not from its curvature there: it is the noise of a loop closure between two knots of the drift.
+What a field says of a shift, beside the track and the other crossings, is found from moments about its peak
+(expectation propagation, Minka 2001), not from its curvature there: the noise of a loop closure between two knots.
 
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
+from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
+from rovgraph.model.calibration import CHART as CHART_STREAM
+from rovgraph.model.calibration import CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
-
-if TYPE_CHECKING:
-    from rovgraph.inference.bottom import Bottom
-    from rovgraph.inference.estimate import Estimate
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 JITTER_M = 0.25  # sd of a shift beside the drift at knots: what it does between them, errors of beams and attitude
@@ -111,11 +110,11 @@ class Drift:
     mean: Array
     P: Array
 
-    def beside(self, sd: float) -> "Drift":
+    def beside(self, mean: Array, sd: float) -> "Drift":
         """With one more knot, never reached: the error of a chart's place, north and east."""
         P = np.pad(self.P, (0, 2))
-        P[-2:, -2:] = max(sd, 1e-3) ** 2 * np.eye(2)
-        return Drift(np.append(self.time, np.inf), np.append(self.mean, [0.0, 0.0]), P)
+        P[-2:, -2:] = sd**2 * np.eye(2)
+        return Drift(np.append(self.time, np.inf), np.append(self.mean, mean), P)
 
     def knot(self, time: float) -> int:
         """The one next to a time."""
@@ -189,8 +188,8 @@ class Crossovers:
 
 
 def with_crossovers(
-    estimate: "Estimate", bottom: "Bottom", chart: ChartFile | None = None, origin: Origin = (0.0, 0.0)
-) -> "tuple[Estimate, Crossovers]":
+    estimate: Estimate, bottom: Bottom, beliefs: Mapping[str, Belief], chart: ChartFile | None, origin: Origin
+) -> tuple[Estimate, Crossovers]:
     """A smoothed track corrected where its soundings show its drift, and what they showed.
 
     The correction and what it leaves of the covariance are exact at the knots of the drift, and interpolated between
@@ -200,6 +199,7 @@ def with_crossovers(
     ----------
     estimate : smoothed, with its joint covariance
     bottom : under it
+    beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
     track, posterior = estimate.trajectory, estimate.posterior
@@ -208,20 +208,24 @@ def with_crossovers(
     times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
     keyframes = np.unique(np.searchsorted(track.time, times).clip(max=len(track) - 1))
     used = bottom.soundings[bottom.soundings["used"] == 1]
-    at, place, depth = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
-    lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], at, place, depth)
+    soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
+    lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
     drift = Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
-    around = None
+    around, place = None, beliefs[CHART_PLACE]
     if chart is not None:
-        drift = drift.beside(chart.settings.position_sd_m)
+        drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
         reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
         around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
     found = match(lines, drift, around)
+    left = drift.given(found.closures) if found.closures else drift
+    if chart is not None:
+        shown = {CHART_PLACE: left.P[-2:, -2:]} if place.estimate else {}
+        values = {CHART_PLACE: left.mean[-2:] if place.estimate else place.mean}
+        rows = calibration_estimates({CHART_PLACE: place}, [CHART_STREAM], values, shown)
+        estimate = replace(estimate, calibration=[*estimate.calibration, *rows])
+        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
     if not found.closures:
         return estimate, found
-    left = drift.given(found.closures)
-    if chart is not None:
-        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
     moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
     interval = np.clip(np.searchsorted(left.time, track.time, side="right") - 1, 0, len(rate) - 1)
     p_n, v_n, cov_p = track.p_n.copy(), track.v_n.copy(), track.cov_p.copy()
@@ -332,7 +336,8 @@ class Field:
 
     def _common(self, x: Array, y: Array, shifts: Array) -> Array:
         """Covariance of the bottom's depth at places x + shift and y, shape (g, n, m)."""
-        r = np.linalg.norm((x[:, None] - y) + shifts[:, None, None], axis=-1)
+        north, east = ((x[:, None, k] - y[:, k]) + shifts[:, None, None, k] for k in (0, 1))
+        r = np.sqrt(north * north + east * east)
         return self._relief.covariance(r) + SLOPE**2 * x @ y.T  # what a slope does over the shift is height
 
     def _likelihood(self, common: Array) -> tuple[Array, Array]:
