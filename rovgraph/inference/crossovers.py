@@ -355,7 +355,7 @@ class Field:
         return L - self._none, misfit
 
 
-def _field_at(
+def field_at(
     lines: Sequence[Line],
     crossing: Crossing,
     predicted: Array,
@@ -495,7 +495,7 @@ def associate(
         known, which = np.unique(cells @ (1 << 20, 1), return_index=True, return_inverse=True)[1:]
         predicted = hypotheses[0].shift(k)[0]
         reach = min(float(np.linalg.norm(step * cells - predicted, axis=1).max()), FARTHEST_M) + BESIDE_M
-        own_field = _field_at(lines, crossings[k], predicted, reach, relief, chart)
+        own_field = field_at(lines, crossings[k], predicted, reach, relief, chart)
         values = np.array(own_field.at(step * cells[known]))[:, which]
         branches, first = [], 0
         for hypothesis, (places, distance2), own in zip(hypotheses, windows, inside, strict=True):
