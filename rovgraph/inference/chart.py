@@ -24,7 +24,7 @@ MOST_AROUND = 4_000_000  # about a track; where there are more, they are taken w
 FOOT = 0.3048  # [m]
 SLOWLY_M = 15.0  # sd of the filter whose outcome varies slowly
 FAR = 0.95  # share of cells without holes, about one by the relief's length, of a depth that is used
-SEEN = 0.5  # share of a piece's soundings that a chart must have
+SEEN = 0.1  # share of a piece's soundings that a chart must have
 OFF_M = 9.0  # depths that differ more in the mean are of another place or datum
 
 
