@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from rovgraph.dive import _Solver
 from rovgraph.errors import InputError
 from rovgraph.inference.chart import DepthChart, read_chart
 from rovgraph.inference.crossovers import Drift, LoopClosure, match
 from rovgraph.inference.relief import Line, fit_relief, lines_of
 from rovgraph.model.config_sections import ChartSettings
+from rovgraph.report.assumptions import leading
 from rovgraph.report.pages.track import _crossings
 
 ORIGIN = 58.3, 11.4
@@ -82,6 +84,38 @@ def test_relief_is_found():
     relief = fit_relief(survey(5)[0])
     assert relief.shows
     assert relief.sd == pytest.approx(0.5, rel=0.4)
+
+
+def test_relief_is_found_by_slanted_beams_that_land_further_out_where_it_is_deeper():
+    lines = survey(5)[0]
+    slanted = [
+        replace(line, place=line.place + np.outer(0.41 * (line.depth - 20.0), (0.0, 1.0) if k < 5 else (1.0, 0.0)))
+        for k, line in enumerate(lines)
+    ]
+    assert fit_relief(slanted).sd == pytest.approx(fit_relief(lines).sd, rel=0.15)
+
+
+def test_a_crossing_whose_soundings_are_not_the_bottoms_is_left_out_of_the_match():
+    lines, drift = survey(1)
+    other = survey(4)[0][5]
+    near = np.abs(lines[5].place[:, 1] - 60.0) < 9.0
+    found = match([*lines[:5], replace(lines[5], depth=np.where(near, other.depth, lines[5].depth))], drift)
+    after = drift.given(found.closures)
+    k = after.knot(1060.0)
+    assert len(found.closures) == 4
+    assert np.abs(after.mean[2 * k : 2 * k + 2] - (2.0, -1.5)).max() < 0.8
+
+
+@pytest.mark.parametrize("verdict", ["doubtful", "wrong"])
+def test_a_dive_that_is_not_trusted_gets_no_crossovers(verdict):
+    smoothed = SimpleNamespace(kind="smoothed", posterior=object())
+    solver = SimpleNamespace(
+        estimates=[smoothed], rivals=(), mirrors=[], dive=lambda more: SimpleNamespace(verdict=verdict)
+    )
+    text, found = _Solver._cross(solver)
+    assert found is None and f"nothing is used: the verdict is {verdict}" in text
+    assert solver.estimates == [smoothed]
+    assert leading(["heading from ahrs", text])[0][0] == text
 
 
 def test_two_crossings_are_too_few():

@@ -28,14 +28,13 @@ from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
 from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
-from rovgraph.model.calibration import CHART as CHART_STREAM
-from rovgraph.model.calibration import CHART_PLACE, Belief
+from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 JITTER_M = 0.25  # sd of a shift beside the drift at knots: what it does between them, errors of beams and attitude
 PIECE_M, CHART_PIECE_M = 25.0, 50.0  # of a line that is run again, or on a chart, matched by itself
-CHART = -1  # "earlier line" of a crossing
+ON_CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
 LEAST_CELLS, MOST_CELLS = 4, 80  # soundings of either line at a crossing
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
@@ -45,7 +44,7 @@ HYPOTHESES = 100  # at most
 LEAD = 10.0  # log likelihood over the next hypothesis [nats]; those behind by twice as much are dropped
 SAME_M = 2.5  # shifts closer than that are the same
 ENOUGH = 3  # crossings
-AGREE = 0.7  # share of the crossings that the best hypothesis must match
+AGREE = 0.5  # share of the crossings about which all likely hypotheses must agree
 SHOWS = 1.0  # of a field whose residuals count [nats]
 MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
 REPEATS = 0.8  # rise of the correlation of lines with themselves: sand waves
@@ -58,7 +57,7 @@ class Crossing:
 
     Attributes
     ----------
-    line, earlier : numbers of the lines, `CHART` of the chart
+    line, earlier : numbers of the lines, `ON_CHART` of the chart
     knots : when it was there, of `Drift`
     centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
     time : of the later line there [s]
@@ -179,8 +178,8 @@ class Crossovers:
         chart = f"; the chart is not used: {self.chart}" if self.chart else ""
         if self.refused:
             return f"crossovers: nothing is used: {self.refused}{chart}"
-        crossed = self._matched([c for c in self.crossings if c.earlier != CHART])
-        charted = self._matched([c for c in self.crossings if c.earlier == CHART])
+        crossed = self._matched([c for c in self.crossings if c.earlier != ON_CHART])
+        charted = self._matched([c for c in self.crossings if c.earlier == ON_CHART])
         counts = [f"{sum(crossed)} of {len(crossed)} crossings of the survey's lines"] if crossed else []
         counts += [f"{sum(charted)} of {len(charted)} pieces on the chart"] if charted else []
         relief = f"relief of {self.relief.sd:.2f} m over {self.relief.length:.1f} m"
@@ -221,7 +220,7 @@ def with_crossovers(
     if chart is not None:
         shown = {CHART_PLACE: left.P[-2:, -2:]} if place.estimate else {}
         values = {CHART_PLACE: left.mean[-2:] if place.estimate else place.mean}
-        rows = calibration_estimates({CHART_PLACE: place}, [CHART_STREAM], values, shown)
+        rows = calibration_estimates({CHART_PLACE: place}, [CHART], values, shown)
         estimate = replace(estimate, calibration=[*estimate.calibration, *rows])
         drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
     if not found.closures:
@@ -281,9 +280,8 @@ def _match(
     gates = (
         (repetition(lines, 2.0 * reach) > REPEATS, "the bottom repeats itself, as sand waves do"),
         (best.score < LEAD, "soundings of its lines do not match"),
-        (best.matched < AGREE, "soundings at too many crossings contradict the best match"),
         (best.misfit > MISFIT, "its soundings contradict the match"),
-        (len(closures) < ENOUGH, "another match is nearly as likely"),
+        (len(closures) < max(ENOUGH, AGREE * best.seen), "another match is nearly as likely"),
     )
     refused = next((why for fails, why in gates if fails), "")
     return ([], refused) if refused else (closures, "")
@@ -320,7 +318,7 @@ def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
     t, p, _ = lines[k].centre
     count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
     middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
-    return [Crossing(k, CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
+    return [Crossing(k, ON_CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
 
 
 class Field:
@@ -364,7 +362,7 @@ def field_at(
     chart: SmoothedChart | None,
 ) -> Field | ChartField:
     """Of soundings in reach of a crossing."""
-    if crossing.earlier == CHART and chart is not None:
+    if crossing.earlier == ON_CHART and chart is not None:
         line = lines[crossing.line]
         own = np.linalg.norm(line.place - crossing.centre, axis=1) < CHART_PIECE_M / 2.0
         return ChartField(line.place[own], line.depth[own], chart, relief)
@@ -395,11 +393,6 @@ class Hypothesis:
     closures: Mapping[int, LoopClosure] = field(default_factory=dict)
     seen: int = 0
     misfits: tuple[float, ...] = ()
-
-    @property
-    def matched(self) -> float:
-        """Share of the crossings."""
-        return len(self.closures) / max(self.seen, 1)
 
     @property
     def misfit(self) -> float:
@@ -484,7 +477,7 @@ def associate(
     while left:
         k = min(left, key=lambda k: hypotheses[0].sd[k])
         far = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(hypotheses[0].shift(k)[1])[-1]))
-        most = CHART_M if crossings[k].earlier == CHART else FARTHEST_M
+        most = CHART_M if crossings[k].earlier == ON_CHART else FARTHEST_M
         if far > most:
             break
         left.remove(k)
