@@ -30,6 +30,7 @@ from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
+from rovgraph.problem.problem import Index
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 JITTER_M = 0.25  # sd of a shift beside the drift at knots: what it does between them, errors of beams and attitude
@@ -129,7 +130,7 @@ class Drift:
         for row, (a, b) in zip(H, ends, strict=True):
             row[a] += 1.0
             row[b] -= 1.0
-        return np.kron(H, np.eye(2))
+        return np.asarray(np.kron(H, np.eye(2)), float)
 
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
@@ -409,7 +410,7 @@ class Hypothesis:
         own = slice(2 * k, 2 * k + 2)
         return self.mean[own], self.P[own, own]
 
-    def window(self, k: int, step: float, most: float) -> tuple[Array, Array]:
+    def window(self, k: int, step: float, most: float) -> tuple[Index, Array]:
         """Where to look: cells of a lattice, shape (n, n, 2), and their squared distances from the mean [sd^2]."""
         m, V = self.shift(k)
         n = int(min(SIGMAS * np.sqrt(np.linalg.eigvalsh(V)[-1]), most) / step) + 1
@@ -492,10 +493,11 @@ def associate(
         values = np.array(own_field.at(step * cells[known]))[:, which]
         branches, first = [], 0
         for hypothesis, (places, distance2), own in zip(hypotheses, windows, inside, strict=True):
-            at = np.full((2, *own.shape), -np.inf)
-            at[:, own] = values[:, first : first + own.sum()]
+            L, misfit = np.full((2, *own.shape), -np.inf)
+            L[own], misfit[own] = values[:, first : first + own.sum()]
             first += int(own.sum())
-            branches += hypothesis.branches(k, crossings[k].knots, step * places, *at, distance2)
+            shifts = np.asarray(step * places, float)
+            branches += hypothesis.branches(k, crossings[k].knots, shifts, L, misfit, distance2)
         hypotheses = _pruned(branches)
     return hypotheses, widest
 
