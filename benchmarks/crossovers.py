@@ -2,6 +2,7 @@
 
     python benchmarks/crossovers.py --surveys 20        errors of a track and soundings, drawn
     python benchmarks/crossovers.py --dives 3           dives of an independent simulator, through the command line
+    python benchmarks/crossovers.py --figure docs/images/crossovers.png
 
 A survey has 12 lines of 500 m, 25 m apart, and four crosslines, 10 m above a bottom whose relief is 1 m over 20 m.
 """
@@ -11,12 +12,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from fault_campaign.beams import Beams, Bottom, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, run_dive
+from fault_campaign.judge import Dive, run_dive, settled_rows, tracks
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
 from scipy.ndimage import map_coordinates
@@ -24,10 +26,13 @@ from scipy.stats import chi2
 
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
-from rovgraph.inference.crossovers import Drift, lines_of, match
+from rovgraph.inference.crossovers import Drift, field_at, match
+from rovgraph.inference.relief import Line, lines_of
 
 KNOT_S = 20.0
-WRONG_M = 3.0  # of a tie: what is left of the shift, if it is beyond 99.9 % of what the track's covariance says, too
+WRONG_M = (
+    3.0  # of a crossing: what is left of its shift, if it is beyond 99.9 % of what the track's covariance says, too
+)
 
 
 def path(lines: int = 12, length: float = 500.0, apart: float = 25.0, crosslines: int = 4) -> Array:
@@ -218,18 +223,27 @@ CASES = {
 
 
 @dataclass
-class Outcome:
-    before: float
-    after: float
-    nees: float
-    ties: int
-    crossings: int
-    wrong: int
-    seconds: float
-    text: str
+class Survey:
+    """Errors of a track and its soundings, drawn.
+
+    Attributes
+    ----------
+    time, true, error : shapes (n,), (n, 2), (n, 2), every second [s, m]; the track is at true - error
+    knots, at_knots : of the drift, shapes (m,), (2 m,)
+    lines, drift, chart : what `match` gets
+    """
+
+    time: Array
+    true: Array
+    error: Array
+    knots: Array
+    at_knots: Array
+    lines: list[Line]
+    drift: Drift
+    chart: DepthChart | None
 
 
-def survey(case: Case, seed: int) -> Outcome:
+def draw(case: Case, seed: int) -> Survey:
     rng = np.random.default_rng([43, seed])
     p = path(*case.size)
     t = np.arange(len(p), dtype=float)
@@ -249,32 +263,89 @@ def survey(case: Case, seed: int) -> Outcome:
     if case.fish:
         inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
         depth -= inside[:, None] * (2.0 if case.dense else rng.uniform(0.0, 4.0, depth.shape))
-    estimated = p - error
-    place = estimated[:, None] + arm
+    place = (p - error)[:, None] + arm
     heading = np.arctan2(way[:, 1], way[:, 0])
-    begin = time.perf_counter()
-    lines = lines_of(t, heading, estimated, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
+    lines = lines_of(t, heading, p - error, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
     drift, chart = Drift(knots, np.zeros(len(P)), P), None
     if case.chart is not None:
-        drift, chart = drift.beside(1e-3), charted(rng, terrain, case.chart)
-    found = match(lines, drift, chart)
+        drift, chart = drift.beside(np.zeros(2), 1e-3), charted(rng, terrain, case.chart)
+    return Survey(t, p, error, knots, e, lines, drift, chart)
+
+
+def shape_rms(error: Array, place: Array) -> float:
+    """What remains of n errors when the whole track is shifted, turned and scaled as it fits best [m]."""
+    e, z = (x[:, 0] + 1j * x[:, 1] for x in (error, place))
+    M = np.column_stack([np.ones_like(z), z])
+    return float(np.sqrt(np.mean(np.abs(e - M @ np.linalg.lstsq(M, e, rcond=None)[0]) ** 2)))
+
+
+@dataclass
+class Outcome:
+    """Of one survey: rms error before and after, and after but for shift, rotation and scale of the whole [m]; NEES,
+    crossings that were used, that there are, and that were matched wrongly."""
+
+    before: float
+    after: float
+    shape: float
+    nees: float
+    used: int
+    crossings: int
+    wrong: int
+    seconds: float
+    text: str
+
+
+def survey(case: Case, seed: int) -> Outcome:
+    drawn = draw(case, seed)
+    begin = time.perf_counter()
+    found = match(drawn.lines, drawn.drift, drawn.chart)
     seconds = time.perf_counter() - begin
-    after = drift.tied(found.ties)
+    after, e = drawn.drift.given(found.closures) if found.closures else drawn.drift, drawn.at_knots
     left = e - after.mean[: len(e)]
     nees, wrong = np.nan, 0
-    if found.ties:
-        each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(knots)))]
+    if found.closures:
+        each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(drawn.knots)))]
         nees = float(np.mean([x @ np.linalg.solve(C, x) / 2 for x, C in each]))
-        off_chart = np.append(left, [0.0, 0.0])
-        pairs = (np.array([tie.knots for tie in found.ties])[:, :, None] * 2 + [0, 1]).transpose(1, 0, 2)
-        off = off_chart[pairs[0]] - off_chart[pairs[1]]
-        for x, (a, b) in zip(off, pairs.swapaxes(0, 1), strict=True):
-            C = after.P[np.ix_(a, a)] + after.P[np.ix_(b, b)] - after.P[np.ix_(a, b)] - after.P[np.ix_(b, a)]
+        H, off_chart = (
+            after.between([c.knots for c in found.closures]),
+            np.append(left, np.zeros(len(after.mean) - len(e))),
+        )
+        for k in range(0, len(H), 2):
+            x, C = H[k : k + 2] @ off_chart, H[k : k + 2] @ after.P @ H[k : k + 2].T
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))
     rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
-    return Outcome(
-        rms[0], rms[1], nees, len(found.ties), len(found.crossings), wrong, seconds, f"{found.text} {found.relief}"
-    )
+    shape = shape_rms(left.reshape(-1, 2), drawn.true[:: int(KNOT_S)])
+    used, crossings = len(found.closures), len(found.crossings)
+    return Outcome(*rms, shape, nees, used, crossings, wrong, seconds, f"{found.text} {found.relief}")
+
+
+def draw_figure(path: str, case: Case, seed: int) -> None:
+    """A survey with and without crossovers, and the field of one of its crossings."""
+    import matplotlib.pyplot as plt
+
+    drawn = draw(case, seed)
+    found = match(drawn.lines, drawn.drift)
+    after = drawn.drift.given(found.closures)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 5.0), layout="constrained")
+    tracks = {
+        "true": (drawn.true, "0.7"),
+        "without crossovers": (drawn.true - drawn.error, "tab:red"),
+        "with crossovers": (drawn.true - drawn.error + after.at(drawn.time), "tab:blue"),
+    }
+    for name, (place, colour) in tracks.items():
+        left.plot(place[:, 1], place[:, 0], color=colour, label=name, linewidth=2.5 if name == "true" else 0.9)
+    left.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
+    left.legend(loc="upper right", fontsize=8)
+    crossing = found.crossings[-5]
+    true = drawn.error[[np.abs(drawn.time - drawn.knots[k]).argmin() for k in crossing.knots]]
+    axis = np.arange(-30.0, 30.5, 0.5)
+    shifts = true[0] - true[1] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))[0]
+    image = right.pcolormesh(axis, axis, L.reshape(len(axis), -1).clip(min=-10.0), cmap="viridis")
+    right.plot(0.0, 0.0, "r+", markersize=12)
+    right.set(xlabel="shift from the true one, east [m]", ylabel="north [m]", aspect="equal")
+    figure.colorbar(image, ax=right, label="log likelihood of one crossing [nats]", shrink=0.8)
+    figure.savefig(path, dpi=110)
 
 
 @dataclass
@@ -312,12 +383,16 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
     return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), level, level, depth=10.0)
 
 
-def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool) -> Dive:
-    """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %."""
+def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool, gyro_scale: float) -> Dive:
+    """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %.
+
+    The gyro's scale decides how far it shows the deviation: an sd of 0.5 % is stated, ``gyro_scale`` is drawn.
+    """
     rng = np.random.default_rng([44, seed])
     motion = survey_motion(*(SMALL if small else Case().size))
     vehicle = make_vehicle("mti", ("ahrs", "depth"))
     beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
+    vehicle.imu.gyr_matrix = np.diag(1.0 + rng.normal(0.0, gyro_scale, 3))
     vehicle.dvl = replace(
         vehicle.dvl, mount_rpy_deg=(0.0, 0.0, -45.0), yaw_sd=0.3, scale_sd=0.003, sd=beams.head.velocity_sd
     )
@@ -330,19 +405,27 @@ def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bo
     return Dive(streams, config, motion, hidden)
 
 
-def print_dives(row: str, seeds: range, small: bool) -> None:
-    """Both ways, smoothed: rms, NEES, seconds, and what was said."""
+def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
+    """Both ways, smoothed: rms, that of the shape, sd, NEES, seconds, and what was said."""
+
+    def inspect(folder: Path, dive: Dive) -> dict[str, float]:
+        rows = settled_rows(dict(tracks(folder))["smoothed"], dive)
+        true = dive.motion.local(rows["time"].to_numpy())[:, :2]
+        return {"shape": shape_rms(true - rows[["north", "east"]].to_numpy(), true)}
+
     for seed in seeds:
-        made = dive(CASES[row].terrain, seed, small)
+        made = dive(CASES[row].terrain, seed, small, gyro_scale)
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
-            got = run_dive(replace(made, configuration=config))
+            got = run_dive(replace(made, configuration=config), inspect=inspect)
             rms, sd, nees = got.rms["smoothed"], got.sd["smoothed"], got.nees["smoothed"]["position"]
             seconds, said = time.perf_counter() - begin, "; ".join(line for line in got.said if "crossovers:" in line)
             how = "with" if crossovers else "without"
-            print(f"| {row} {seed} | {how} | {rms:.2f} | {sd:.2f} | {nees:.2f} | {seconds:.0f} | {said} |", flush=True)
-            if got.verdicts["smooth"] != "trusted":
-                print(*got.said, sep="\n", flush=True)
+            print(
+                f"| {row} {seed} | {how} | {rms:.2f} | {got.found['shape']:.2f} | {sd:.2f} | {nees:.2f} | "
+                f"{seconds:.0f} | {got.verdicts['smooth']} | {said} |",
+                flush=True,
+            )
 
 
 def main() -> None:
@@ -353,9 +436,14 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
     parser.add_argument("--small", action="store_true", help="dives of 8 lines of 250 m, with three crosslines")
+    parser.add_argument("--gyro-scale", type=float, default=0.005, help="sd of the gyro's scale errors in dives")
+    parser.add_argument("--figure", help="draw a survey to this file")
     given = parser.parse_args()
+    if given.figure:
+        draw_figure(given.figure, CASES[given.rows[0]], given.first)
+        return
     if given.dives:
-        print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small)
+        print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small, given.gyro_scale)
         return
     for name in given.rows:
         out = []
@@ -363,11 +451,12 @@ def main() -> None:
             out.append(survey(CASES[name], given.first + k))
             if given.verbose:
                 print("   ", out[-1], flush=True)
-        before, after = (np.sqrt(np.mean([getattr(o, n) ** 2 for o in out])) for n in ("before", "after"))
-        some = [o for o in out if o.ties]
+        rms = (np.sqrt(np.mean([getattr(o, n) ** 2 for o in out])) for n in ("before", "after", "shape"))
+        before, after, shape = rms
+        some = [o for o in out if o.used]
         print(
-            f"| {name} | {before:.1f} | {after:.1f} | {after / before:.2f} | {len(some)} of {len(out)} | "
-            f"{sum(o.ties for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
+            f"| {name} | {before:.1f} | {after:.1f} | {after / before:.2f} | {shape:.1f} | {len(some)} of {len(out)} | "
+            f"{sum(o.used for o in out)} | {sum(o.wrong for o in out)} | {sum(o.wrong > 0 for o in out)} | "
             f"{np.mean([o.nees for o in some]) if some else np.nan:.2f} | "
             f"{np.mean([o.seconds for o in out]):.1f} |",
             flush=True,

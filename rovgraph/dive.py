@@ -271,10 +271,13 @@ class _Solver:
             why = "they need a smoothed track of a dive without places or iSAM2"
         elif self.rivals or self.mirrors:
             why = "another explanation of the dive is as likely"
+        elif (verdict := self.dive({}).verdict) != "trusted":
+            why = f"the verdict is {verdict}, and they would make the track more certain of its error"
         elif (bottom := bottom_of(self.log, self.initial.config, first)) is None:
             why = "the log has no ranges to the bottom"
         else:
-            self.estimates[0], found = with_crossovers(first, bottom, self.chart, self.log.origin or (0.0, 0.0))
+            about = self.initial.beliefs, self.chart, self.log.origin or (0.0, 0.0)
+            self.estimates[0], found = with_crossovers(first, bottom, *about)
             return found.text, found
         return f"crossovers: nothing is used: {why}", None
 

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from rovgraph.dive import _Solver
 from rovgraph.errors import InputError
 from rovgraph.inference.chart import DepthChart, read_chart
-from rovgraph.inference.crossovers import Drift, Line, Tie, fit_relief, lines_of, match
+from rovgraph.inference.crossovers import Drift, LoopClosure, match
+from rovgraph.inference.relief import Line, fit_relief, lines_of
 from rovgraph.model.config_sections import ChartSettings
+from rovgraph.report.assumptions import leading
 from rovgraph.report.pages.track import _crossings
 
 ORIGIN = 58.3, 11.4
@@ -53,10 +56,10 @@ def survey(seed: int, sd: float = 0.5, shift=(2.0, -1.5)):
 def test_a_crossline_finds_its_shift():
     lines, drift = survey(1)
     found = match(lines, drift)
-    after = drift.tied(found.ties)
+    after = drift.given(found.closures)
     k = after.knot(1060.0)
     off = after.mean[2 * k : 2 * k + 2] - (2.0, -1.5)
-    assert len(found.ties) >= 3
+    assert len(found.closures) >= 3
     assert np.abs(off).max() < 0.6
     assert off @ np.linalg.solve(after.P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], off) < 12.0
     assert "of 5 crossings of the survey's lines matched" in found.text
@@ -65,7 +68,7 @@ def test_a_crossline_finds_its_shift():
 def test_a_flat_bottom_is_not_used():
     lines, drift = survey(2, sd=1e-3)
     found = match(lines, drift)
-    assert not found.ties and not found.relief.shows
+    assert not found.closures and not found.relief.shows
     assert "nothing is used: the bottom shows no relief" in found.text
 
 
@@ -73,7 +76,7 @@ def test_soundings_of_another_bottom_are_not_used():
     lines, drift = survey(3)
     other, _ = survey(4)
     found = match([*lines[:5], other[5]], drift)
-    assert not found.ties
+    assert not found.closures
     assert "nothing is used" in found.text
 
 
@@ -83,15 +86,49 @@ def test_relief_is_found():
     assert relief.sd == pytest.approx(0.5, rel=0.4)
 
 
+def test_relief_is_found_by_slanted_beams_that_land_further_out_where_it_is_deeper():
+    lines = survey(5)[0]
+    slanted = [
+        replace(line, place=line.place + np.outer(0.41 * (line.depth - 20.0), (0.0, 1.0) if k < 5 else (1.0, 0.0)))
+        for k, line in enumerate(lines)
+    ]
+    assert fit_relief(slanted).sd == pytest.approx(fit_relief(lines).sd, rel=0.15)
+
+
+def test_a_crossing_whose_soundings_are_not_the_bottoms_is_left_out_of_the_match():
+    lines, drift = survey(1)
+    other = survey(4)[0][5]
+    near = np.abs(lines[5].place[:, 1] - 60.0) < 9.0
+    found = match([*lines[:5], replace(lines[5], depth=np.where(near, other.depth, lines[5].depth))], drift)
+    after = drift.given(found.closures)
+    k = after.knot(1060.0)
+    assert len(found.closures) == 4
+    assert np.abs(after.mean[2 * k : 2 * k + 2] - (2.0, -1.5)).max() < 0.8
+
+
+@pytest.mark.parametrize("verdict", ["doubtful", "wrong"])
+def test_a_dive_that_is_not_trusted_gets_no_crossovers(verdict):
+    smoothed = SimpleNamespace(kind="smoothed", posterior=object())
+    solver = SimpleNamespace(
+        estimates=[smoothed], rivals=(), mirrors=[], dive=lambda more: SimpleNamespace(verdict=verdict)
+    )
+    text, found = _Solver._cross(solver)
+    assert found is None and f"nothing is used: the verdict is {verdict}" in text
+    assert solver.estimates == [smoothed]
+    assert leading(["heading from ahrs", text])[0][0] == text
+
+
 def test_two_crossings_are_too_few():
     lines, drift = survey(1)
     found = match([lines[0], lines[1], lines[5]], drift)
-    assert not found.ties and "fewer than 3 times" in found.text
+    assert not found.closures and "fewer than 3 times" in found.text
 
 
-def test_a_tie_corrects_both_ends_by_what_they_are_unsure_of():
+def test_a_loop_closure_corrects_both_ends_by_what_they_are_unsure_of():
     P = np.diag([1.0, 1.0, 3.0, 3.0])
-    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).tied([Tie((1, 0), 1e8 * np.eye(2), np.array([2e8, 0.0]))])
+    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).given(
+        [LoopClosure((1, 0), 1e8 * np.eye(2), np.array([2e8, 0.0]))]
+    )
     assert after.mean == pytest.approx([-0.5, 0.0, 1.5, 0.0], abs=1e-6)
     assert np.diag(after.P) == pytest.approx([0.75] * 4, abs=1e-6)
 
@@ -109,7 +146,7 @@ def test_a_bottom_that_repeats_itself_is_not_used():
     lines, drift = survey(1)
     z = [20.0 + 0.5 * np.sin(2.0 * np.pi * (line.place @ (0.8, 0.6)) / 10.0) for line in lines]
     found = match([replace(line, depth=depth) for line, depth in zip(lines, z, strict=True)], drift)
-    assert not found.ties and "repeats itself" in found.text
+    assert not found.closures and "repeats itself" in found.text
 
 
 def test_fish_are_left_out():
@@ -135,13 +172,15 @@ def lost(shift=(6.0, -4.0)):
     """Three lines of a survey whose whole track is off by a shift, which has an sd of 8 m."""
     lines, drift = survey(6, shift=(0.0, 0.0))
     P = 64.0 * np.kron(np.ones((120, 120)), np.eye(2)) + 1e-4 * np.eye(240)
-    return [replace(line, place=line.place - shift) for line in lines[:3]], Drift(drift.time, drift.mean, P).beside(0.1)
+    return [replace(line, place=line.place - shift) for line in lines[:3]], Drift(drift.time, drift.mean, P).beside(
+        np.zeros(2), 0.1
+    )
 
 
 def test_a_chart_shows_where_a_track_is():
     lines, drift = lost()
     found = match(lines, drift, charted(6))
-    after = drift.tied(found.ties)
+    after = drift.given(found.closures)
     assert np.abs(after.mean[:2] - (6.0, -4.0)).max() < 0.5
     assert after.P[0, 0] < 0.3
     assert "6 of 6 pieces on the chart" in found.text
@@ -151,14 +190,14 @@ def test_a_chart_with_holes_shows_it_too():
     lines, drift = lost()
     chart = charted(6)
     chart.depth[60:75, 30:60] = np.nan
-    after = drift.tied(match(lines, drift, chart).ties)
+    after = drift.given(match(lines, drift, chart).closures)
     assert np.abs(after.mean[:2] - (6.0, -4.0)).max() < 0.7
 
 
 @pytest.mark.parametrize("seed", range(7, 10))
 def test_a_chart_of_another_place_is_not_used(seed):
     found = match(*lost(), charted(seed))
-    assert not found.ties and "nothing is used" in found.text
+    assert not found.closures and "nothing is used" in found.text
 
 
 @pytest.mark.parametrize(
@@ -172,7 +211,7 @@ def test_a_chart_of_another_place_is_not_used(seed):
 def test_a_chart_that_cannot_be_of_the_bottom_is_named(change, said):
     chart = charted(6)
     found = match(*lost(), replace(chart, depth=change(chart.depth)))
-    assert not found.ties and said in found.text
+    assert not found.closures and said in found.text
 
 
 def geotiff(path, values, crs="EPSG:32632", flipped=False):

@@ -3,7 +3,7 @@
 Depths of a chart count from its own datum, soundings from the surface: what lies between is not known and not needed.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.inference.relief import SLOPE, Relief
 from rovgraph.model.config_sections import ChartSettings
 from rovgraph.model.origin import Origin, lat_lon
 
@@ -22,6 +24,7 @@ MOST_AROUND = 4_000_000  # about a track; where there are more, they are taken w
 FOOT = 0.3048  # [m]
 SLOWLY_M = 15.0  # sd of the filter whose outcome varies slowly
 FAR = 0.95  # share of cells without holes, about one by the relief's length, of a depth that is used
+SEEN = 0.1  # share of a piece's soundings that a chart must have
 OFF_M = 9.0  # depths that differ more in the mean are of another place or datum
 
 
@@ -92,20 +95,16 @@ class DepthChart:
         cells = np.moveaxis((place - self.corner) / self.step, -1, 0)
         return np.asarray(map_coordinates(self.depth, cells, order=1, cval=np.nan))
 
-    def smoothed(self, covariance: Callable[[Array], Array], length: float) -> "SmoothedChart":
+    def smoothed(self, relief: Relief) -> "SmoothedChart":
         """The bottom as the chart shows it, by kriging: relief is normal about what varies slowly.
 
         The errors are those far from holes; what is near one is left out.
-
-        Parameters
-        ----------
-        covariance, length : of the relief at distances, and its correlation length [m]
         """
         from scipy.ndimage import gaussian_filter  # type: ignore[attr-defined]
 
         shape = tuple(2 * n for n in self.depth.shape)
         away = np.hypot(*np.meshgrid(*(self.step * n * np.abs(np.fft.fftfreq(n)) for n in shape), indexing="ij"))
-        S = np.fft.rfft2(covariance(away)).real.clip(min=0.0)
+        S = np.fft.rfft2(relief.covariance(away)).real.clip(min=0.0)
         known = np.isfinite(self.depth)
         wide = SLOWLY_M / self.step
         share = gaussian_filter(known.astype(float), wide, mode="nearest")
@@ -115,7 +114,7 @@ class DepthChart:
         mirrored = np.concatenate([mirrored, mirrored[:, ::-1]], axis=1)
         shown = np.fft.irfft2(np.fft.rfft2(mirrored) * S / (S + self.sd**2), shape)[: len(rest), : rest.shape[1]]
         error = np.fft.irfft2(S * self.sd**2 / (S + self.sd**2), shape)[0, : rest.shape[1]]
-        far = gaussian_filter(known.astype(float), length / self.step, mode="nearest") > FAR
+        far = gaussian_filter(known.astype(float), relief.length / self.step, mode="nearest") > FAR
         return SmoothedChart(np.where(known & far, slow + shown, np.nan), self.corner, self.step, self.sd, error)
 
     def refused(self, place: Array, depth: Array) -> str:
@@ -146,6 +145,41 @@ class SmoothedChart(DepthChart):
     def covariance(self, r: Array) -> Array:
         """Of the errors of depths some distances apart."""
         return np.interp(r, self.step * np.arange(len(self.error)), self.error)
+
+
+class ChartField:
+    """Log likelihood of the shift of a piece of a line on a chart, over that of a bottom that the chart does not show.
+
+    Soundings in holes do not count.
+    """
+
+    def __init__(self, x: Array, z: Array, chart: SmoothedChart, relief: Relief) -> None:
+        self._x, self._z, self._chart = x, z, chart
+        r, away = np.linalg.norm(x[:, None] - x, axis=-1), x - x.mean(axis=0)
+        own = relief.of_line(x)
+        self._known, self._alone = own + chart.covariance(r), own + relief.covariance(r) + SLOPE**2 * away @ away.T
+
+    def at(self, shifts: Array) -> tuple[Array, Array]:
+        """The field and squared residuals by their number at g shifts, shape (g,) each."""
+        off = self._z - self._chart.at(self._x + shifts[:, None])
+        seen = np.isfinite(off)
+        share = seen.mean(axis=1)
+        whole, some = np.flatnonzero(share == 1.0), np.flatnonzero((share > SEEN) & (share < 1.0))
+        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
+        for rows in (whole, *np.array_split(some, len(some) // 512 + 1)):
+            use = seen[rows[:1]] if rows is whole else seen[rows]
+            with_chart, chi2 = _log_normal(self._known, np.where(seen[rows], off[rows], 0.0), use)
+            alone, _ = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
+            out[rows], misfit[rows] = with_chart - alone, chi2 / seen[rows].sum(axis=1)
+        return out, misfit
+
+
+def _log_normal(covariance: Array, off: Array, use: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Log densities of residuals that are used, shape (g, n), without their constant, and squares of the white ones."""
+    L = np.linalg.cholesky(np.where(use[:, :, None] & use[:, None], covariance, np.eye(len(covariance))))
+    white = (np.linalg.inv(L) @ off[..., None])[..., 0] if len(L) == 1 else np.linalg.solve(L, off[..., None])[..., 0]
+    chi2 = (white**2).sum(axis=-1)
+    return -0.5 * chi2 - np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1), chi2
 
 
 def read_chart(settings: ChartSettings, origin: Origin | None) -> ChartFile | None:

@@ -192,6 +192,7 @@ _CONTROL = "".join(
 )  # letters of what beams of a DVL need; printable ones are for sensors outside
 _MARKS = "!#$%&()*+,-./:;<"  # letters of their variables
 WATER_LAYER = "water_layer"  # sensor: the water's velocity as profiles of cells show it
+CHART, CHART_PLACE = "chart", "chart_place"  # of the bottom, and the error of its place
 LAYERS = tuple(f"water_layer_{k + 1}" for k in range(14))  # knots of the current's profile that are kept at a time
 
 
@@ -726,6 +727,17 @@ TABLE: dict[str, Variable] = {
                 follows=partial(_knot, k),
             )
             for k, name in enumerate(LAYERS)
+        ),
+        Variable(
+            CHART_PLACE,
+            chr(26),
+            ("_north", "_east"),
+            "m",
+            1.0,
+            (CHART,),
+            "how far north and east of where the chart has it the bottom lies",
+            "soundings over relief, while the track is known by fixes or by its start",
+            estimate=True,
         ),
     )
 }

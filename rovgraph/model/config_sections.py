@@ -652,7 +652,6 @@ class ChartSettings(ConfigSection):
         description="GeoTIFF of depths or heights in metres; soundings are compared with it, as with earlier lines",
     )
     sd_m: Positive = Field(0.5, description="error of a cell's depth, beside an offset of all")
-    position_sd_m: NotNegative = Field(1.0, description="how far the chart as a whole may be off, north and east")
 
 
 def _stamped(sensor: str) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 MOST = 3
 MATTERING = (  # how the lines go that matter, the most important first
+    "crossovers: ",
     "profiles of the water are left out",
     "nothing checks the compass",
     "alone: it will drift",
