@@ -248,7 +248,7 @@ def test_chain_and_filter_agree_through_moving_windows(descent):
     smoother = assemble(log, initial)
     problem = smoother.problem
     moved = window_changes(problem)
-    assert len(moved) > 5 and all(new_knots(problem, k, 4) for k in moved.tolist())
+    assert len(moved) > 5 and all(new_knots(problem, k, config.water) for k in moved.tolist())
     back, chain = replay(problem, initial).smoothed().trajectory, smoother.solve().trajectory
     sd = chain.to_frame()[["north_sd", "east_sd"]].to_numpy()
     late = slice(len(problem) // 4, None)

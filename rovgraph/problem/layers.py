@@ -6,7 +6,8 @@ linear between them, each a random walk in time, and from knot to knot a first-o
     u_j = exp(-h / L) u_i + w,  var w = s^2 (1 - exp(-2 h / L)),  i next to j                       (Gelb 1974, 3.8)
 
 A window of K knots about the vehicle is kept, knot j in the place j mod K. As the vehicle descends, the window moves:
-a knot that is left behind makes room for a new one, which is drawn from its neighbour. So the dive stays a chain.
+a knot that is left behind makes room for a new one, which is drawn from its neighbour. So the dive stays a chain. With
+one knot, the current is that at the middle of the cells, and follows from what it was where the vehicle came from.
 
 The cells of a profile, y = Phi (v - u), share the vehicle's velocity v; Phi has the weights of the knots u in each
 cell, whose sum is 1. The square-root information of the cells, R with R' R = Phi' W Phi, has two entries in a row, next
@@ -30,6 +31,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement, Stream
 from rovgraph.model.calibration import LAYERS, LAYOUT, WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.config_sections import Water
 from rovgraph.problem.problem import Problem
 from rovgraph.sensors.dvl_beam import BeamGeometry, beam_geometry
 from rovgraph.sensors.sensor import LARGEST_SD
@@ -227,7 +229,9 @@ class WaterLayers:
         head, spacing, K = depth + float(self._below_sensor @ down_b), self.config.water.knot_m, len(self._places)
         place = (head + cells.down) / spacing
         if K == 1:
-            return self._rows(np.zeros(len(place)), cells, -1), first
+            middle = float(place.mean())
+            first = first if first is not None and abs(middle - first) < 1.0 else round(middle)
+            return self._rows(np.zeros(len(place)), cells, first), first
         low, high = math.floor(place.min()), math.floor(place.max()) + 1
         first = low if first is None else min(max(first, high - K + 1), low)
         within = place < first + K - 1
@@ -371,10 +375,19 @@ def by_mapped_beams(along: Array, far: Array, down: Array, head: BeamGeometry, d
 
 
 class NewKnot(NamedTuple):
-    """A knot that takes another's place: the variables of both, and of its neighbour, None where it has none."""
+    """A knot that takes another's place.
+
+    Attributes
+    ----------
+    name : the variable
+    neighbour : that it follows from; its own name: what it was before; None: nothing
+    kept, sd : of the neighbour's deviation from its mean, and what is added [m/s]
+    """
 
     name: str
     neighbour: str | None
+    kept: float
+    sd: float
 
 
 def put_windows(keyframes: Array, rows: Array, of: NDArray[np.int64], layer: int, begin: int, context: int) -> None:
@@ -408,11 +421,13 @@ def window_changes(problem: Problem) -> NDArray[np.int64]:
     return np.flatnonzero((first[1:] != first[:-1]) & np.isfinite(first[1:])) + 1
 
 
-def new_knots(problem: Problem, k: int, count: int) -> list[NewKnot]:
-    """Knots that are new at keyframe k, each after its neighbour, of ``count`` that are kept."""
-    before, now = problem.keyframes[k - 1 : k + 1, assembly.FIRST_KNOT].tolist()
-    if count < 2 or now == before or math.isnan(now):
+def new_knots(problem: Problem, k: int, water: Water) -> list[NewKnot]:
+    """Knots that are new at keyframe k, each after its neighbour."""
+    count, (before, now) = water.knots or len(LAYERS), problem.keyframes[k - 1 : k + 1, assembly.FIRST_KNOT].tolist()
+    if now == before or math.isnan(now):
         return []
+    if count == 1:
+        return [] if math.isnan(before) else [NewKnot("current", "current", *_conditional(water, abs(now - before)))]
     first = int(now)
     if not abs(now - before) < count:  # never where that is nan
         chain = [(first, None), *((j, j - 1) for j in range(first + 1, first + count))]
@@ -420,10 +435,16 @@ def new_knots(problem: Problem, k: int, count: int) -> list[NewKnot]:
         chain = [(j, j - 1) for j in range(int(before) + count, first + count)]
     else:
         chain = [(j, j + 1) for j in range(int(before) - 1, first - 1, -1)]
-    return [NewKnot(LAYERS[j % count], None if i is None else LAYERS[i % count]) for j, i in chain]
+    follows, alone = _conditional(water), (0.0, water.current_sd_mps)
+    return [
+        NewKnot(LAYERS[j % count], None, *alone)
+        if i is None
+        else NewKnot(LAYERS[j % count], LAYERS[i % count], *follows)
+        for j, i in chain
+    ]
 
 
-def conditional(config: Config) -> tuple[float, float]:
-    """What a knot keeps of its neighbour, and the sd that is added [m/s]."""
-    kept = math.exp(-config.water.knot_m / config.water.correlation_m)
-    return kept, config.water.current_sd_mps * math.sqrt(1.0 - kept**2)
+def _conditional(water: Water, apart: float = 1.0) -> tuple[float, float]:
+    """What a knot keeps of another, so many knots ``apart``, and the sd that is added [m/s]."""
+    kept = math.exp(-apart * water.knot_m / water.correlation_m)
+    return kept, water.current_sd_mps * math.sqrt(1.0 - kept**2)
