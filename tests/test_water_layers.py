@@ -229,15 +229,23 @@ def test_water_track_is_not_used_beside_the_profiles_that_it_is_a_mean_of(descen
     )
 
 
-def test_gtsam_and_isam2_refuse_layers_in_one_line(descent):
+@pytest.mark.slow
+@pytest.mark.parametrize("knots", [4, 1])
+def test_isam2_knows_the_track_as_the_filter_does(descent, knots):
+    """Through moving windows; its knots keep their values for a segment of time, so a little differs."""
     pytest.importorskip("gtsam")
-    from rovgraph.inference.graph.batch import refuse_layers
+    from rovgraph.inference.graph.isam2 import run_isam2
 
     log, config = descent
+    config = config.model_copy(update={"water": config.water.model_copy(update={"knots": knots})})
     initial = initialise(log, config)
-    roles = unknowns(initial.beliefs, assemble(log, initial).problem.used)
-    with pytest.raises(InputError, match=r"profiles of the water; state water\.use: false"):
-        refuse_layers(roles)
+    problem = assemble(log, initial).problem
+    isam2 = run_isam2(problem, initial, update_s=1.0).filtered().trajectory
+    filtered = smooth(log, config, "filtered").main.trajectory
+    late = slice(len(problem) // 4, None)
+    sd = np.sqrt(filtered.cov_p[late, 0, 0])
+    assert (np.abs(isam2.p_n - filtered.p_n)[late, :2] < 0.1 * sd[:, None]).all()
+    np.testing.assert_allclose(np.sqrt(isam2.cov_p[late, 0, 0]), sd, rtol=0.05)
 
 
 @pytest.mark.slow

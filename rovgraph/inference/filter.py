@@ -328,7 +328,7 @@ class FilterEngine:
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
         """Whether kernels can take the whole interval that ends with keyframe k."""
-        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k) or self._new_knots(problem, k):
+        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k) or self.new_knots(problem, k):
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
 
@@ -514,7 +514,7 @@ class FilterEngine:
             P[index, index] += self.beliefs[name].sd ** 2
         return replace(known, P=P)
 
-    def _new_knots(self, problem: Problem, k: int) -> list[NewKnot]:
+    def new_knots(self, problem: Problem, k: int) -> list[NewKnot]:
         """Knots of the water's current that are new at keyframe k."""
         if WATER_LAYER not in self.initial.instruments:
             return []
@@ -523,7 +523,7 @@ class FilterEngine:
 
     def _predict_changed(self, problem: Problem, k: int, departed: Gaussian) -> Transition:
         """`predict`, of variables whose value changes, and of knots that take the place of others."""
-        known, knots = self._changed(departed, problem, k), self._new_knots(problem, k)
+        known, knots = self._changed(departed, problem, k), self.new_knots(problem, k)
         if not knots:
             return self.predict(problem, k, known)
         n, mean = len(known.P), self.unknowns.fixed

@@ -518,7 +518,9 @@ def _of_water(config: Config, current: Belief) -> dict[str, Belief]:
     at_knots = (TABLE[name] for name in LAYERS)
     out = {v.name: Belief(v, np.zeros(v.dim), water.current_sd_mps, True, water.walk_mps) for v in at_knots}
     if knots == 1:
-        out["current"] = replace(current, streams=(*TABLE["current"].sensors, WATER_LAYER))
+        stated = "sd" in config.calibration.current.model_fields_set  # type: ignore[attr-defined]
+        sd = current.sd if stated else water.current_sd_mps
+        out["current"] = replace(current, sd=sd, streams=(WATER_LAYER, *TABLE["current"].sensors))
     return out | {name: replace(out[name], streams=()) for name in LAYERS[knots if knots > 1 else 0 :]}
 
 

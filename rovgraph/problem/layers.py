@@ -45,6 +45,7 @@ REMEMBERED_S = 120.0  # of depth and altitude, online
 SETTLED_S = 1.0  # after the start of a dive from which on profiles count
 TOGETHER_S = 1e-4  # stamps of the cells of one profile
 SAME_M = 1e-6  # depths that differ by rounding
+LONE_STEP = 0.1  # of the depth, in knots, from which on the only knot follows
 FILLED = 1e-9  # part of a knot's weight below which no cell is near it
 OUT_OF_SIGHT = 1e3  # sd by which what stood in a knot's place before is forgotten [m/s]
 BESIDE, UNLIKE_SD = 2, 6.0  # cells on each side that a cell is compared with, and how far it may be off
@@ -185,7 +186,7 @@ class WaterLayers:
                 self._signals[sensor] = streams[sensor].time.tolist(), streams[sensor].data[:, 0].tolist()
         return [self.of(streams[CELLS], imu, None, left_out)]
 
-    def of(self, cells: Stream, imu: Array, first: int | None, left_out: Left) -> Stream:
+    def of(self, cells: Stream, imu: Array, first: float | None, left_out: Left) -> Stream:
         """Measurements of layers: components, their sd, context and number of the layer, shape (k, 7 + LAYER_WIDTH).
 
         Parameters
@@ -209,8 +210,8 @@ class WaterLayers:
         return Stream(WATER_LAYER, (), np.array(time), np.concatenate(rows), np.array(lines, np.int64))
 
     def _profile(
-        self, time: float, data: Array, imu: Array, first: int | None, left_out: Left
-    ) -> tuple[Array, int | None]:
+        self, time: float, data: Array, imu: Array, first: float | None, left_out: Left
+    ) -> tuple[Array, float | None]:
         """Measurements of one profile, and the uppermost knot."""
         empty, depth = np.empty((0, 7 + at.LAYER_WIDTH)), self._depth(time)
         if math.isnan(depth):
@@ -230,7 +231,7 @@ class WaterLayers:
         place = (head + cells.down) / spacing
         if K == 1:
             middle = float(place.mean())
-            first = first if first is not None and abs(middle - first) < 1.0 else round(middle)
+            first = first if first is not None and abs(middle - first) < LONE_STEP else middle
             return self._rows(np.zeros(len(place)), cells, first), first
         low, high = math.floor(place.min()), math.floor(place.max()) + 1
         first = low if first is None else min(max(first, high - K + 1), low)
@@ -294,12 +295,12 @@ class WaterLayers:
             alike[order] = np.abs(vertical - median) <= UNLIKE_SD * sd
         return alike
 
-    def _rows(self, place: Array, cells: Cells, first: int) -> Array:
+    def _rows(self, place: Array, cells: Cells, first: float) -> Array:
         """At most one measurement between two knots; ``place`` is the depth of each cell in knots."""
         believed, rho = np.array(self.config.water.cell_sd_mps), self.config.water.cell_correlation
         relative = self._relative(cells.sd)
         K = len(self._places)
-        above = np.floor(place).astype(np.int64) - first if K > 1 else np.zeros(len(place), np.int64)
+        above = np.floor(place).astype(np.int64) - int(first) if K > 1 else np.zeros(len(place), np.int64)
         share, weight = place - np.floor(place), 1.0 / np.square(relative)
         here, below, right = np.zeros(K), np.zeros(K), np.zeros((K + 1, 3))
         np.add.at(here, above, weight * (1.0 - share) ** 2)
@@ -318,7 +319,7 @@ class WaterLayers:
             root = math.sqrt(pivot)
             q = (right[k] - before * q) / root
             before = below[k] / root
-            total, knot = root + before, first + k
+            total, knot = root + before, int(first) + k
             context = np.zeros(at.LAYER_WIDTH)
             context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
             context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
