@@ -27,7 +27,6 @@ from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
-from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.layers import UNLIKE, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
 from rovgraph.readers.records import Refused
 from rovgraph.sensors.dvl import DvlVelocity

@@ -424,18 +424,19 @@ def window_changes(problem: Problem) -> NDArray[np.int64]:
 
 def new_knots(problem: Problem, k: int, water: Water) -> list[NewKnot]:
     """Knots that are new at keyframe k, each after its neighbour."""
-    count, (before, now) = water.knots or len(LAYERS), problem.keyframes[k - 1 : k + 1, assembly.FIRST_KNOT].tolist()
-    if now == before or math.isnan(now):
+    first = problem.keyframes[:, assembly.FIRST_KNOT]
+    if k == 0 or first[k] == first[k - 1] or math.isnan(first[k]):
         return []
+    count, before, now = water.knots or len(LAYERS), float(first[k - 1]), float(first[k])
     if count == 1:
         return [] if math.isnan(before) else [NewKnot("current", "current", *_conditional(water, abs(now - before)))]
-    first = int(now)
+    top = int(now)
     if not abs(now - before) < count:  # never where that is nan
-        chain = [(first, None), *((j, j - 1) for j in range(first + 1, first + count))]
+        chain = [(top, None), *((j, j - 1) for j in range(top + 1, top + count))]
     elif now > before:
-        chain = [(j, j - 1) for j in range(int(before) + count, first + count)]
+        chain = [(j, j - 1) for j in range(int(before) + count, top + count)]
     else:
-        chain = [(j, j + 1) for j in range(int(before) - 1, first - 1, -1)]
+        chain = [(j, j + 1) for j in range(int(before) - 1, top - 1, -1)]
     follows, alone = _conditional(water), (0.0, water.current_sd_mps)
     return [
         NewKnot(LAYERS[j % count], None, *alone)

@@ -53,7 +53,7 @@ from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion_residual import motion_errors
 from rovgraph.kernels.states import States
 from rovgraph.log import Measurement
-from rovgraph.model.calibration import LAYOUT, TABLE, Belief, WATER_LAYER
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER, Belief
 from rovgraph.model.gauss_markov import walked
 from rovgraph.model.state import PLACE, PLACE_DIM, POSE, State
 from rovgraph.problem.assembly import assembly_of
@@ -292,7 +292,7 @@ class Incremental:
         """Of time, that an interval lies in: one begins where knots of the current are new, too."""
         if k == 0:
             return 0
-        before, here = problem.keyframes[k - 1 : k + 1, SEGMENT]
+        before, here = problem.keyframes[k - 1 : k + 1, SEGMENT].tolist()
         return self._terms[k - 1].segment + int(here != before or bool(self._filter.new_knots(problem, k)))
 
     def update(self) -> None:
