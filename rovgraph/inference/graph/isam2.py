@@ -125,7 +125,7 @@ class IntervalTerms:
         seen = problem.number[let_in] >= 0
         self.landmarks, others = let_in[seen].tolist(), let_in[~seen]
         here = problem.keyframe[others] == k
-        if filter.new_knots(problem, k):  # those before do not know them
+        if any(knot.name != knot.neighbour for knot in filter.new_knots(problem, k)):  # those before do not know them
             known = here | (problem.which[others] != problem.sensors.index(WATER_LAYER))
             others, here = others[known], here[known]
         self.before = KeyframeTerms(filter, problem, others[~here]) if not here.all() else None
