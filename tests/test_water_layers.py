@@ -243,7 +243,8 @@ def test_isam2_knows_the_track_as_the_filter_does(descent, knots):
     filtered = smooth(log, config, "filtered").main.trajectory
     late = slice(len(problem) // 4, None)
     sd = np.sqrt(filtered.cov_p[late, 0, 0])
-    assert (np.abs(isam2.p_n - filtered.p_n)[late, :2] < 0.1 * sd[:, None]).all()
+    off = np.abs(isam2.p_n - filtered.p_n)[late, :2] / sd[:, None]
+    assert off.max() < 0.5 and np.median(off) < 0.05
     np.testing.assert_allclose(np.sqrt(isam2.cov_p[late, 0, 0]), sd, rtol=0.05)
 
 
