@@ -289,8 +289,10 @@ class WaterLayers:
         if n > BESIDE:
             order = np.argsort(cells.down)
             vertical = cells.velocity[order] @ down_s
-            padded = np.pad(vertical, BESIDE, constant_values=np.nan)
-            median = np.nanmedian([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            padded = np.pad(vertical, BESIDE, constant_values=np.inf)  # behind all others
+            nearby = np.sort([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            count, each = np.isfinite(nearby).sum(axis=0), np.arange(n)
+            median = 0.5 * (nearby[(count - 1) // 2, each] + nearby[count // 2, each])
             sd = self._relative(cells.sd[order]) * self.config.water.cell_sd_mps[2]
             alike[order] = np.abs(vertical - median) <= UNLIKE_SD * sd
         return alike
