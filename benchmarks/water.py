@@ -55,6 +55,7 @@ class Setting:
     depth : that is reached [m]
     fast : sd of what changes in time in the current, at 200 s and 15 m [m/s]; 0 = nothing, and it is stated so
     stated : sd of a cell that is stated over the true one
+    water : keys of the section `water` that are stated
     """
 
     profiler: Profiler | None = field(default_factory=Profiler)
@@ -64,6 +65,7 @@ class Setting:
     fast: float = 0.0
     stated: float = 1.0
     cliff: bool = False
+    water: dict[str, float] = field(default_factory=dict)
 
     @property
     def lost(self) -> tuple[float, float]:
@@ -110,6 +112,7 @@ def make_dive(setting: Setting, seed: int) -> tuple[Dive, pd.DataFrame | None]:
     config["water"] = {"cell_sd_mps": [setting.stated * sd for sd in unit.sd]}
     if not setting.fast:
         config["water"]["walk_mps"] = 5e-4
+    config["water"] |= setting.water
     C_bs = mounting((*vehicle.dvl.mount_rpy_deg[:2], hidden.dvl_yaw))
     table = profiles(motion, vehicle, unit, current, C_bs, rng)
     for axis in "xyz":
@@ -137,6 +140,9 @@ ROWS = {
     "one cell": Row(Setting(Profiler(1, 4.0, 4.0))),
     "restless": Row(Setting(fast=0.04)),
     "sd of cells stated a fifth": Row(Setting(stated=0.2)),
+    "one knot": Row(Setting(water={"knots": 1})),
+    "restless, and it is not stated": Row(Setting(fast=0.04, water={"walk_mps": 5e-4})),
+    "knots 50 m apart": Row(Setting(water={"knot_m": 50.0})),
     "no layers": Row(Setting(None)),
     "cliff": Row(Setting(surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
     "cliff, 600 kHz": Row(Setting(WORKHORSE_600, surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
@@ -225,8 +231,9 @@ def main() -> None:
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     ends = ["filtered at the bottom", "smoothed at the end", "online at the bottom"]
     heads = ["descent", *ends, "met", *heads, "verdicts"]
-    if rows:
-        print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
+    if not rows:
+        return
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
     with workers(arguments.jobs) as pool:
         for name in rows:
             with starting():
