@@ -10,7 +10,6 @@ from dataclasses import replace
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import freedom
 from rovgraph.model.calibration import LAYERS, Belief
-from rovgraph.problem.calibration_roles import unknowns
 
 STEP = 1.5  # from one walk that is tried to the next
 MOST = 16  # of these
@@ -24,13 +23,12 @@ def knots_walking_faster(best: ChainOptimum) -> dict[str, Belief]:
     names = [name for name in LAYERS if name in best.chain.layout.walking]
     if not names:
         return {}
-    log_determinant, least = best.linear
-    losses = [_loss(best, _walking(best, names, 1.0 / STEP)), freedom(best.chain, log_determinant) + 0.5 * least]
+    losses = [_loss(best, _walking(best, names, 1.0 / STEP)), _loss(best, {})]
     while losses[-1] < losses[-2] and len(losses) < MOST:
         losses.append(_loss(best, _walking(best, names, STEP ** (len(losses) - 1))))
-    slower, likeliest, faster = losses[-3:] if len(losses) > 2 else (losses[0], losses[0], losses[1])
-    if losses[0] - likeliest < CLEAR:
+    if losses[0] - losses[-2] < CLEAR:
         return {}
+    slower, likeliest, faster = losses[-3:]
     beyond = 0.5 * (slower - faster) / (slower - 2.0 * likeliest + faster)  # of a parabola through the three
     factor = TOGETHER * STEP ** (len(losses) - 3 + beyond)
     return _walking(best, names, factor) if factor > WORTH else {}
@@ -42,7 +40,7 @@ def _walking(best: ChainOptimum, names: list[str], factor: float) -> dict[str, B
 
 def _loss(best: ChainOptimum, knots: dict[str, Belief]) -> float:
     """Minus log likelihood with other walks, up to what does not change with them."""
-    beliefs = {**best.chain.beliefs, **knots}
-    chain = replace(best.chain, beliefs=beliefs, unknowns=unknowns(beliefs, best.problem.used))
+    walks = {**best.unknowns.walks, **{name: belief.walk for name, belief in knots.items()}}
+    chain = replace(best.chain, beliefs={**best.beliefs, **knots}, unknowns=replace(best.unknowns, walks=walks))
     root = chain.eliminate(best.linearised_at, best.solution.gates, diagonal=True)
     return freedom(chain, root.log_determinant()) + 0.5 * root.left
