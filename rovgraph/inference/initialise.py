@@ -594,7 +594,11 @@ def _resolve_layers(
     if layers:
         config = with_knots(config, log.streams, whole=not expected)
         knots, spacing = config.water.knots, config.water.knot_m
-        said = "one, that of the cells' depth" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        said = (
+            "one, that of the cells' depth"
+            if knots == 1
+            else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        )
         assumptions.append(f"profiles of the water are used; the current: {said}")
         if "dvl_water" in log:
             assumptions.append("dvl_water is left out: it is a mean of the cells of the profiles")

@@ -103,7 +103,8 @@ def _walk(unknowns: CalibrationRoles, name: str, index: int, duration: float, kn
     if knot is not None and knot.neighbour == name:
         kept, sd = kept * knot.kept, np.hypot(kept * knot.sd, sd)
     elif knot is not None:
-        kept, sd, there = knot.kept, knot.sd, calibration_key(unknowns, str(knot.neighbour), index)
+        kept, sd = np.array(knot.kept), np.array(knot.sd)
+        there = calibration_key(unknowns, str(knot.neighbour), index)
     elif name not in unknowns.time_constants:
         return gtsam.BetweenFactorVector(there, here, 0.0 * mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), sd))
     weight, origin = np.eye(len(mean)) / sd, gtsam.Values()
