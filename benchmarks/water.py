@@ -2,6 +2,7 @@
 
     python benchmarks/water.py                                     every row, 20 seeds, and what layers cost
     python benchmarks/water.py --rows "300 kHz" --seeds 3 --online
+    python benchmarks/water.py --figure docs/images/water.png      a descent with layers, with one cell, and without
 
 prints a table in Markdown: what each row is about, with its target, what was found, and the horizontal rms error and
 NEES of the smoothed, filtered and online estimates. A dive lies at the surface with fixes, descends at 1 m/s and goes
@@ -28,6 +29,7 @@ from fault_campaign.judge import (
     honest_nees,
     horizontal_error,
     row_options,
+    run_command,
     run_dive,
     tracks,
     write_dive,
@@ -55,6 +57,7 @@ class Setting:
     depth : that is reached [m]
     fast : sd of what changes in time in the current, at 200 s and 15 m [m/s]; 0 = nothing, and it is stated so
     stated : sd of a cell that is stated over the true one
+    water : keys of the section `water` that are stated
     """
 
     profiler: Profiler | None = field(default_factory=Profiler)
@@ -64,6 +67,7 @@ class Setting:
     fast: float = 0.0
     stated: float = 1.0
     cliff: bool = False
+    water: dict[str, float] = field(default_factory=dict)
 
     @property
     def lost(self) -> tuple[float, float]:
@@ -110,6 +114,7 @@ def make_dive(setting: Setting, seed: int) -> tuple[Dive, pd.DataFrame | None]:
     config["water"] = {"cell_sd_mps": [setting.stated * sd for sd in unit.sd]}
     if not setting.fast:
         config["water"]["walk_mps"] = 5e-4
+    config["water"] |= setting.water
     C_bs = mounting((*vehicle.dvl.mount_rpy_deg[:2], hidden.dvl_yaw))
     table = profiles(motion, vehicle, unit, current, C_bs, rng)
     for axis in "xyz":
@@ -137,6 +142,9 @@ ROWS = {
     "one cell": Row(Setting(Profiler(1, 4.0, 4.0))),
     "restless": Row(Setting(fast=0.04)),
     "sd of cells stated a fifth": Row(Setting(stated=0.2)),
+    "one knot": Row(Setting(water={"knots": 1})),
+    "restless, and it is not stated": Row(Setting(fast=0.04, water={"walk_mps": 5e-4})),
+    "knots 50 m apart": Row(Setting(water={"knot_m": 50.0})),
     "no layers": Row(Setting(None)),
     "cliff": Row(Setting(surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
     "cliff, 600 kHz": Row(Setting(WORKHORSE_600, surface_s=120.0, depth=60.0, cliff=True), None, 2.0),
@@ -214,10 +222,52 @@ def cost(rounds: int) -> tuple[float, float]:
     return least[0], least[1]
 
 
+def draw_descent(path: Path) -> None:
+    """Errors and sds of the filter on the way down, and the current that layers show, in the first dive of a row."""
+    import tempfile
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.0), layout="constrained")
+    error, current = figure.subplots(1, 2, width_ratios=(3, 2), sharey=True)
+    for name, colour in (("no layers", "0.3"), ("one cell", "tab:red"), ("300 kHz", "tab:blue")):
+        dive, table = make_dive(ROWS[name].setting, 0)
+        with tempfile.TemporaryDirectory() as folder:
+            write_dive(dive, Path(folder), {} if table is None else {"adcp": table})
+            files = [f"{folder}/{part}" for part in ("log.csv", "vehicle.yaml", "out")]
+            run_command(["smooth", files[0], "--config", files[1], "--out", files[2], "--no-figures"])
+            track = pd.read_csv(f"{files[2]}/trajectory_filtered.csv")
+            found = None if table is None else pd.read_csv(f"{files[2]}/current.csv")
+        track = track[(track["time"] > ROWS[name].setting.surface_s) & (track["down"] < 500.0 - LOCK_M)]
+        off = track[["north", "east"]].to_numpy() - dive.motion.local(track["time"].to_numpy())[:, :2]
+        label = {"300 kHz": "25 cells of 4 m", "one cell": "one cell", "no layers": "IMU alone"}[name]
+        error.plot(np.hypot(*off.T), track["down"], color=colour, label=label)
+        error.plot(np.hypot(track["north_sd"], track["east_sd"]), track["down"], color=colour, linestyle=":")
+    error.set(xscale="log", xlabel="horizontal error, dotted: sd [m]", ylabel="depth [m]", xlim=(0.3, None))
+    error.legend(frameon=False, fontsize=8)
+    depth = np.arange(500.0)
+    true = draw(np.random.default_rng([29, 0]), 650.0).at(depth, depth)  # the one of the first dive
+    assert found is not None
+    last = found.groupby("depth").last()
+    last = last[last.index < depth[-1]]
+    for axis, colour in (("north", "tab:green"), ("east", "tab:purple")):
+        current.plot(true[:, int(axis == "east")], depth, color=colour, label=f"{axis}: true, estimated")
+        bars = {"xerr": 2.0 * last[f"{axis}_sd"], "fmt": ".", "markersize": 3, "linewidth": 0.8}
+        current.errorbar(last[axis], last.index, color=colour, **bars)
+    current.set(xlabel="current [m/s], bars: 2 sd")
+    current.legend(frameon=False, fontsize=8)
+    error.invert_yaxis()
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Run and print."""
     parser = row_options(__doc__, [*ROWS, "cost"], cores())
+    parser.add_argument("--figure", type=Path, help="draw a descent instead of the table")
     arguments = parser.parse_args()
+    if arguments.figure:
+        draw_descent(arguments.figure)
+        return
     rows = [name for name in arguments.rows if name != "cost"]
     if "cost" in arguments.rows:
         layers, without = cost(3)
@@ -225,8 +275,9 @@ def main() -> None:
     heads = [f"{kind} {what}" for kind in ("smoothed", "filtered", "online") for what in ("rms (sd) [m]", "NEES")]
     ends = ["filtered at the bottom", "smoothed at the end", "online at the bottom"]
     heads = ["descent", *ends, "met", *heads, "verdicts"]
-    if rows:
-        print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
+    if not rows:
+        return
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
     with workers(arguments.jobs) as pool:
         for name in rows:
             with starting():

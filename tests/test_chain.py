@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from rovgraph.inference.graph.optimum import GraphOptimum
 from rovgraph.inference.graph.places import smooth_graph
 from rovgraph.inference.optimum import Optimum
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.log.companions import usable_cells
 from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, TABLE
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.state import BIAS, POSE, VELOCITY
+from rovgraph.problem.layers import window_changes
 from rovgraph.sensors import SENSORS
 from rovgraph.simulate import Style, Waves, lake
 from rovgraph.simulate import simulated as driven
@@ -125,6 +128,20 @@ def beams() -> Case:
     return by_beams(case.log, case.config)
 
 
+def layers(knots: int) -> Case:
+    """A descent without bottom lock, through several windows of the current's knots."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    import water
+    from fault_campaign.instruments import log_table
+
+    setting = water.Setting(water.Profiler(3, 4.0, 4.0), surface_s=8.0, depth=45.0)
+    dive, table = water.make_dive(setting, 1)
+    exact = {name: {"estimate": False} for name, variable in TABLE.items() if variable.considered}
+    config = changed(Config.model_validate(dive.configuration), water={"knots": knots}, calibration=exact)
+    cells = usable_cells({name: table[name].to_numpy() for name in table}, config, "adcp")
+    return Log.from_frame(log_table(dive.streams), config).with_profiles(cells), config
+
+
 SCENARIOS: dict[str, Callable[[], Case]] = {
     "both compasses and misalignment": both_compasses,
     "calibration that walks": walking,
@@ -136,6 +153,8 @@ SCENARIOS: dict[str, Callable[[], Case]] = {
     "every sensor but places": every_sensor,
     "acoustic positioning": acoustic,
     "beams of the DVL": beams,
+    "layers of the water": partial(layers, 3),
+    "one layer of the water": partial(layers, 1),
 }
 
 
@@ -165,6 +184,8 @@ IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
     "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
     "IMU outage": lambda best: best.problem.coasted.any(),
+    "layers of the water": lambda best: LAYERS[2] in best.unknowns.estimated and len(window_changes(best.problem)) > 2,
+    "one layer of the water": lambda best: "current" in best.unknowns.walks and len(window_changes(best.problem)) > 5,
     "outliers": lambda best: 5 < int((~best.solution.gates["dvl"]).sum()) < 20,
 }
 

@@ -246,7 +246,8 @@ def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
     states = whole.history.states.at([j - 1, j])
     x = np.concatenate([states.R_nb.reshape(2, 9), states.p_n + 0.01, states.v_n - 0.02, states.bias], axis=1)
     c = calibration_vector({name: value[-1] for name, value in states.calibration.items()})
-    (rows,) = Linearization(engine, whole.initial.prior).linearize([IntervalTerms(engine, problem, j, own)], x, c[None])
+    terms = IntervalTerms(engine, problem, j, own, segment=0)
+    (rows,) = Linearization(engine, whole.initial.prior).linearize([terms], x, c[None])
     values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k in range(2):
         insert_state(values, j - 1 + k, states_of(x[k : k + 1], c))

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from rovgraph.inference.error_state import replay
 from rovgraph.inference.initialise import initialise
 from rovgraph.inference.smoother import assemble
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.assembly import FIRST_KNOT
+from rovgraph.kernels.assembly import FIRST_KNOT, KEYFRAME
 from rovgraph.live.outputs.json_lines import json_line
 from rovgraph.live.sources.json_lines import JsonRow
 from rovgraph.log import Log, Stream
@@ -27,7 +28,6 @@ from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix, parse_config
 from rovgraph.model.state import State
 from rovgraph.problem.assembly import assembly_of
-from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.layers import UNLIKE, WaterLayers, by_mapped_beams, layer_sensors, new_knots, window_changes
 from rovgraph.readers.records import Refused
 from rovgraph.sensors.dvl import DvlVelocity
@@ -201,19 +201,25 @@ def test_range_and_heading_of_the_table_are_not_those_of_other_sensors():
     np.testing.assert_allclose(stream["adcp_heading"], 0.1)
 
 
-@pytest.fixture(scope="module")
-def descent() -> tuple[Log, Config]:
-    """A short descent through three windows, without bottom lock in the middle, and profiles of a sheared current."""
+def descending(seed: int = 1, knots: int = 4, surface_s: float = 40.0, **setting: Any) -> tuple[Log, Config, Array]:
+    """A descent to 100 m without bottom lock in the middle, through sheared water, and where it ends."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     import water
     from fault_campaign.instruments import log_table
-    from fault_campaign.water import Profiler
 
-    dive, table = water.make_dive(water.Setting(Profiler(5, 4.0, 4.0), surface_s=40.0, depth=100.0), 1)
-    dive.configuration["water"]["knots"] = 4
+    profiler = water.Profiler(5, 4.0, 4.0)
+    dive, table = water.make_dive(water.Setting(profiler, surface_s=surface_s, depth=100.0, **setting), seed)
+    dive.configuration["water"]["knots"] = knots
     config = Config.model_validate(dive.configuration)
     log = Log.from_frame(log_table(dive.streams), config)
-    return log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp")), config
+    log = log.with_profiles(usable_cells({n: table[n].to_numpy() for n in table}, config, "adcp"))
+    return log, config, dive.motion.local(np.array([dive.motion.duration]))[0]
+
+
+@pytest.fixture(scope="module")
+def descent() -> tuple[Log, Config]:
+    """A short descent through three windows."""
+    return descending()[:2]
 
 
 def test_water_track_is_not_used_beside_the_profiles_that_it_is_a_mean_of(descent):
@@ -229,15 +235,68 @@ def test_water_track_is_not_used_beside_the_profiles_that_it_is_a_mean_of(descen
     )
 
 
-def test_gtsam_and_isam2_refuse_layers_in_one_line(descent):
+@pytest.mark.slow
+@pytest.mark.parametrize("knots", [4, 1])
+def test_isam2_knows_the_track_as_the_filter_does(descent, knots):
+    """Through moving windows; its knots keep their values for a segment of time, so a little differs."""
     pytest.importorskip("gtsam")
-    from rovgraph.inference.graph.batch import refuse_layers
+    from rovgraph.inference.graph.isam2 import run_isam2
 
     log, config = descent
+    config = config.model_copy(update={"water": config.water.model_copy(update={"knots": knots})})
     initial = initialise(log, config)
-    roles = unknowns(initial.beliefs, assemble(log, initial).problem.used)
-    with pytest.raises(InputError, match=r"profiles of the water; state water\.use: false"):
-        refuse_layers(roles)
+    problem = assemble(log, initial).problem
+    isam2 = run_isam2(problem, initial, update_s=1.0).filtered().trajectory
+    filtered = smooth(log, config, "filtered").main.trajectory
+    late = slice(len(problem) // 4, None)
+    sd = np.sqrt(filtered.cov_p[late, 0, 0])
+    off = np.abs(isam2.p_n - filtered.p_n)[late, :2] / sd[:, None]
+    assert off.max() < 0.5 and np.median(off) < 0.05
+    np.testing.assert_allclose(np.sqrt(isam2.cov_p[late, 0, 0]), sd, rtol=0.05)
+
+
+def test_the_only_knot_follows_the_depth_as_the_current_changes_with_it():
+    made, zero, first = layers("water: {knots: 1}"), np.zeros(2), []
+    for depth in (20.0, 20.9, 21.1, 60.0):
+        made._signals["depth"] = [9.9], [depth]
+        profile = cells(10.0, range=np.array([4.0, 6.0]), vx=zero, vy=zero, vz=zero)
+        (row,) = context(made.of(profile, LEVEL, first[-1] if first else None, Counter()))
+        first.append(float(row[at.FIRST_KNOT]))
+    np.testing.assert_allclose(first, [2.5, 2.5, 2.61, 6.5])
+    keyframes = np.zeros((4, KEYFRAME))
+    keyframes[:, FIRST_KNOT] = first
+    problem = SimpleNamespace(keyframes=keyframes)
+    water = Config().water.model_copy(update={"knots": 1})
+    assert [len(new_knots(problem, k, water)) for k in range(4)] == [0, 0, 1, 1]
+    (knot,) = new_knots(problem, 3, water)
+    kept = np.exp(-38.9 / water.correlation_m)
+    assert knot == ("current", "current", pytest.approx(kept), pytest.approx(0.3 * np.sqrt(1.0 - kept**2)))
+
+
+@pytest.mark.slow
+def test_one_knot_in_sheared_water_is_uncertain_and_not_wrong():
+    """Where one current is carried down, it is off by several sds."""
+    square = []
+    for seed in range(4):
+        log, config, end = descending(seed, knots=1)
+        track = smooth(log, config, "smoothed").main.trajectory
+        off = track.p_n[-1, :2] - end[:2]
+        square.append(off @ np.linalg.solve(track.cov_p[-1, :2, :2], off) / 2.0)
+    assert np.mean(square) < 2.0, square
+
+
+@pytest.mark.slow
+def test_a_current_that_changes_faster_than_stated_is_found_and_used():
+    """At 0.04 m/s within 200 s it walks 4e-3 m/s/rts; half as much again is believed, for what is alike over depth."""
+    log, config, _ = descending(surface_s=200.0, fast=0.04)
+    slow = config.model_copy(update={"water": config.water.model_copy(update={"walk_mps": 5e-4})})
+    found = smooth(log, slow)
+    (noise,) = found.main.summary["noise_found"]
+    assert noise["key"] == "water.walk_mps" and noise["values"] == pytest.approx(6e-3, rel=0.25)
+    assert found.dive.initial.beliefs["water_layer_1"].walk == pytest.approx(noise["values"])
+    assert not smooth(log, config, "smoothed").main.summary.get("noise_found")  # 6e-3, the default
+    calm, config, _ = descending(surface_s=200.0)
+    assert not smooth(calm, config, "smoothed").main.summary.get("noise_found")
 
 
 @pytest.mark.slow
@@ -248,7 +307,7 @@ def test_chain_and_filter_agree_through_moving_windows(descent):
     smoother = assemble(log, initial)
     problem = smoother.problem
     moved = window_changes(problem)
-    assert len(moved) > 5 and all(new_knots(problem, k, 4) for k in moved.tolist())
+    assert len(moved) > 5 and all(new_knots(problem, k, config.water) for k in moved.tolist())
     back, chain = replay(problem, initial).smoothed().trajectory, smoother.solve().trajectory
     sd = chain.to_frame()[["north_sd", "east_sd"]].to_numpy()
     late = slice(len(problem) // 4, None)

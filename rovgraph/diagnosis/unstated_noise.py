@@ -1,8 +1,9 @@
 """Noise and DVL lever arm that the configuration does not state, found in the residuals.
 
-Noise may be larger than stated, or errors may last. Both are returned as `Beliefs`, with which filter and smoother
-solve the dive again. A wrong constant makes residuals that look like either, so no noise is reported where alarms name
-a constant. Late stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
+Noise may be larger than stated, errors may last, and a current may change faster. All are returned as `Beliefs`, with
+which filter and smoother solve the dive again. A wrong constant makes residuals that look like these, so no noise is
+reported where alarms name a constant. Late stamps of the same sensor are a rival: an error that lasts must make the
+dive likelier than these do.
 
 The factor of white noise comes from differences of successive residuals, which errors that last do not change:
 
@@ -31,9 +32,10 @@ from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival
 from rovgraph.inference.gauss_newton import rejects
 from rovgraph.inference.lever_arm_bias import ARM
 from rovgraph.inference.score_test import score_test
+from rovgraph.inference.water_walk import knots_walking_faster
 from rovgraph.inference.widened_chain import lasting_belief
 from rovgraph.log.units import behind, shown
-from rovgraph.model.calibration import AUTO, MOUNT, TABLE
+from rovgraph.model.calibration import AUTO, MOUNT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config
 from rovgraph.problem.initial_conditions import Beliefs
 from rovgraph.rules import BENT, RULES
@@ -139,7 +141,7 @@ class UnstatedNoise:
 def find_noise(
     best: ChainOptimum, config: Config, alarms: Sequence[Alarm], likely: float = LIKELY
 ) -> tuple[list[UnstatedNoise], list[Rival]]:
-    """White noise that is larger than stated, and the place of a DVL that is elsewhere; these have no rivals.
+    """White noise that is larger than stated, a faster current, and a DVL that is elsewhere; these have no rivals.
 
     Parameters
     ----------
@@ -152,7 +154,8 @@ def find_noise(
     found = [_placed(best, place)] if place is not None and place.size > likely else []
     if found or _named_elsewhere(alarms, best):
         return found, []
-    return [larger for sensor in best.blocks if (larger := _larger(best, sensor, config)) is not None], []
+    larger = [_larger(best, sensor, config) for sensor in best.blocks]
+    return [one for one in (*larger, _restless(best)) if one is not None], []
 
 
 def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> tuple[list[UnstatedNoise], list[Rival]]:
@@ -240,6 +243,18 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
     value = tuple(factor * s for s in stated) if isinstance(stated, tuple) else factor * stated
     cause = f"its noise is {factor:.2g} times what {key} states, by its residuals"
     return UnstatedNoise(sensor, key, value, cause, "the larger noise is used", Beliefs(noise={sensor: factor}))
+
+
+def _restless(best: ChainOptimum) -> UnstatedNoise | None:
+    """A current that changes faster than the configuration states."""
+    knots = knots_walking_faster(best)
+    if not knots:
+        return None
+    walk = next(iter(knots.values())).walk
+    cause = (
+        f"the current changes {walk / best.beliefs[next(iter(knots))].walk:.2g} times as fast as water.walk_mps has it"
+    )
+    return UnstatedNoise(WATER_LAYER, "water.walk_mps", walk, cause, "the faster walk is used", Beliefs(knots))
 
 
 def noise_factor(r: Array) -> float | None:

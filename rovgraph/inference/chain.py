@@ -22,11 +22,11 @@ from rovgraph.inference.gauss_newton import GatedMeasurements, Gates
 from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
 from rovgraph.kernels.elimination import DiveFactors, eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE, TIME
-from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, WATER_LAYER, Belief, calibration_size
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER, Belief, calibration_size
 from rovgraph.model.state import COLUMNS, State
 from rovgraph.problem.calibration_roles import CalibrationRoles
 from rovgraph.problem.initial_conditions import InitialConditions
-from rovgraph.problem.layers import OUT_OF_SIGHT, NewKnot, conditional, new_knots, window_changes
+from rovgraph.problem.layers import OUT_OF_SIGHT, NewKnot, new_knots, window_changes
 from rovgraph.problem.measurements import (
     Measurements,
     Seen,
@@ -178,17 +178,22 @@ class Chain:
             sd[ends[(ends > 0) & (ends < len(self.problem.time))] - 1, self._walking(name)] = self.beliefs[name].sd
         for k, knots in self._windows:
             for knot in knots:
-                sd[k - 1, self._walking(knot.name)] = OUT_OF_SIGHT
+                at = k - 1, self._walking(knot.name)
+                if knot.neighbour == knot.name:
+                    sd[at] = np.hypot(kept[at] * knot.sd, sd[at])
+                    kept[at] *= knot.kept
+                else:
+                    sd[at] = OUT_OF_SIGHT
         return 1.0 / sd, kept
 
     @cached_property
     def _windows(self) -> list[tuple[int, list[NewKnot]]]:
         """Keyframes at which knots of the water's current are new, and these."""
-        if WATER_LAYER not in self.initial.instruments or LAYERS[0] not in self.layout.places:
+        if WATER_LAYER not in self.initial.instruments:
             return []
-        count = self.initial.config.water.knots or len(LAYERS)
-        changes = [(k, new_knots(self.problem, k, count)) for k in window_changes(self.problem).tolist()]
-        return [(k, knots) for k, knots in changes if knots]
+        water, changed = self.initial.config.water, window_changes(self.problem).tolist()
+        changes = [(k, new_knots(self.problem, k, water)) for k in changed]
+        return [(k, [knot for knot in knots if knot.name in self.layout.places]) for k, knots in changes]
 
     @cached_property
     def _conditionals(self) -> tuple[NDArray[np.int64], Array]:
@@ -196,15 +201,15 @@ class Chain:
 
         Shapes (r,), (r, d - 15); their residual is the Jacobian times what walks.
         """
-        kept, sd = conditional(self.initial.config)
-        alone = self.initial.config.water.current_sd_mps
         keyframe, rows = [], [np.empty((0, self.layout.d - MOTION))]
         for k, knots in self._windows:
-            for knot in knots:
+            for name, neighbour, kept, sd in knots:
+                if neighbour == name:  # that is its walk
+                    continue
                 row = np.zeros((2, self.layout.d - MOTION))
-                row[:, self._walking(knot.name)] = np.eye(2) / (alone if knot.neighbour is None else sd)
-                if knot.neighbour is not None:
-                    row[:, self._walking(knot.neighbour)] = -kept * np.eye(2) / sd
+                row[:, self._walking(name)] = np.eye(2) / sd
+                if neighbour is not None:
+                    row[:, self._walking(neighbour)] = -kept * np.eye(2) / sd
                 rows.append(row)
                 keyframe += [k, k]
         return np.array(keyframe, np.int64), np.concatenate(rows)

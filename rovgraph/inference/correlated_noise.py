@@ -247,14 +247,14 @@ class _Baseline:
 
     @property
     def minus_log_likelihood(self) -> float:
-        return self.solution.cost + _freedom(self.chain, self.log_determinant)
+        return self.solution.cost + freedom(self.chain, self.log_determinant)
 
     def linear_gain(self, name: str, sd: float, time_constant: float) -> float:
         """Of log likelihood, by one more error, of the dive as it is linearised here."""
         wider = with_lasting(self.chain, name, sd, time_constant)
         root = wider.eliminate(begin_at(wider, self.solution.point), self.solution.gates, diagonal=True)
-        without = 0.5 * self.least + _freedom(self.chain, self.log_determinant)
-        return without - 0.5 * root.left - _freedom(wider, root.log_determinant())
+        without = 0.5 * self.least + freedom(self.chain, self.log_determinant)
+        return without - 0.5 * root.left - freedom(wider, root.log_determinant())
 
     def with_error(self, name: str, sd: float, time_constant: float) -> "_Baseline":
         """The dive with one more error, solved from here."""
@@ -407,7 +407,7 @@ def _reopened(now: _Baseline, passed: Collection[str]) -> list[tuple[GaussMarkov
         if np.sqrt(np.mean(path**2)) > _largest(chain, name):
             continue
         same = chain.eliminate(now.solution.point, fitted.solution.gates, diagonal=True).log_determinant()
-        price = _freedom(fitted.chain, fitted.log_determinant) - _freedom(chain, same)
+        price = freedom(fitted.chain, fitted.log_determinant) - freedom(chain, same)
         out.append((replace(likely, gain=least - fitted.solution.cost - price), fitted))
     return out
 
@@ -570,7 +570,7 @@ def _implausible(chain: Chain, error: GaussMarkovError) -> bool:
     return error.sd > ROUGHLY * _largest(chain, error.variable)
 
 
-def _freedom(chain: Chain, log_determinant: float) -> float:
+def freedom(chain: Chain, log_determinant: float) -> float:
     """Minus log likelihood of a dive less its cost, up to what does not change with what is estimated.
 
     Parameters

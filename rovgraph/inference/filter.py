@@ -69,11 +69,11 @@ from rovgraph.kernels.filtering import (
 )
 from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.measurement_row import MeasuredRows
-from rovgraph.model.calibration import LAYERS, LAYOUT, TABLE, WATER_LAYER, calibration_size
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER, calibration_size
 from rovgraph.model.state import DIMENSION, PLACE, PLACE_DIM, Jacobians
 from rovgraph.problem.calibration_roles import unknowns
 from rovgraph.problem.initial_conditions import InitialConditions
-from rovgraph.problem.layers import NewKnot, conditional, new_knots, window_changes
+from rovgraph.problem.layers import NewKnot, new_knots, window_changes
 from rovgraph.problem.measurements import KeyframeRows, Measurements, compiled, sensor_table
 from rovgraph.problem.problem import Index, Problem
 from rovgraph.sensors import SENSORS, CompiledModel, SensorModel, WaterVelocity
@@ -328,7 +328,7 @@ class FilterEngine:
 
     def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
         """Whether kernels can take the whole interval that ends with keyframe k."""
-        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k) or self._new_knots(problem, k):
+        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k) or self.new_knots(problem, k):
             return False
         return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
 
@@ -514,30 +514,27 @@ class FilterEngine:
             P[index, index] += self.beliefs[name].sd ** 2
         return replace(known, P=P)
 
-    def _new_knots(self, problem: Problem, k: int) -> list[NewKnot]:
+    def new_knots(self, problem: Problem, k: int) -> list[NewKnot]:
         """Knots of the water's current that are new at keyframe k."""
         if WATER_LAYER not in self.initial.instruments:
             return []
-        return new_knots(problem, k, self.initial.config.water.knots or len(LAYERS))
+        knots = new_knots(problem, k, self.initial.config.water)
+        return [knot for knot in knots if knot.name in self.layout.columns]
 
     def _predict_changed(self, problem: Problem, k: int, departed: Gaussian) -> Transition:
         """`predict`, of variables whose value changes, and of knots that take the place of others."""
-        known, knots = self._changed(departed, problem, k), self._new_knots(problem, k)
+        known, knots = self._changed(departed, problem, k), self.new_knots(problem, k)
         if not knots:
             return self.predict(problem, k, known)
-        n, (kept, sd) = len(known.P), conditional(self.initial.config)
-        alone, S, added, c = self.initial.config.water.current_sd_mps, np.eye(n), np.zeros((n, n)), known.c.copy()
-        for name, neighbour in knots:
-            place = self.layout.columns[name]
-            S[place], added[place], added[:, place] = 0.0, 0.0, 0.0
-            c[LAYOUT[name]] = 0.0
-            if neighbour is None:
-                added[place, place] = alone**2 * np.eye(place.stop - place.start)
-                continue
-            by = self.layout.columns[neighbour]
-            S[place], c[LAYOUT[name]] = kept * S[by], kept * c[LAYOUT[neighbour]]
-            added[place], added[:, place] = kept * added[by], kept * added[:, by]
-            added[place, place] = kept**2 * added[by, by] + sd**2 * np.eye(place.stop - place.start)
+        n, mean = len(known.P), self.unknowns.fixed
+        S, added, c = np.eye(n), np.zeros((n, n)), known.c.copy()
+        for name, neighbour, kept, sd in knots:
+            place, other = self.layout.columns[name], name if neighbour is None else neighbour
+            by = self.layout.columns[other]
+            c[LAYOUT[name]] = mean[name] + kept * (c[LAYOUT[other]] - mean[other])
+            of_other = kept**2 * added[by, by]
+            S[place], added[place], added[:, place] = kept * S[by], kept * added[by], kept * added[:, by]
+            added[place, place] = of_other + sd**2 * np.eye(place.stop - place.start)
         moved = replace(known, c=c, P=S @ known.P @ S.T + added, B=S @ known.B if known.B.size else known.B)
         after = self.predict(problem, k, moved)
         return replace(after, F=after.F @ S, Q=after.Q + after.F @ added @ after.F.T)

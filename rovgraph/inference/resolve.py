@@ -197,7 +197,8 @@ def _layers(dive: Resolution) -> None:
     if layers:
         dive.config = with_knots(dive.config, dive.log.streams, whole=not dive.expected)
         knots, spacing = dive.config.water.knots, dive.config.water.knot_m
-        said = "one for all depths" if knots == 1 else f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        about = f"{knots} knots {spacing:.3g} m apart about the vehicle's depth"
+        said = "one, that of the cells' depth" if knots == 1 else about
         dive.assume(f"profiles of the water are used; the current: {said}")
         if "dvl_water" in dive.log:
             dive.assume("dvl_water is left out: it is a mean of the cells of the profiles")

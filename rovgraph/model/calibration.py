@@ -245,8 +245,11 @@ def _beacon(k: int) -> tuple[Variable, Variable]:
 
 
 def _current(config: Any, entry: Any) -> dict[str, Any]:
-    """One for all depths is shown by profiles of the water, too."""
-    return {"streams": ("thruster", "dvl_water", WATER_LAYER)} if config.water.knots == 1 else {}
+    """That of the cells' depth is shown by profiles of the water, and believed as the current at a knot is."""
+    if config.water.knots != 1:
+        return {}
+    prior = {} if entry is not None and "sd" in entry.model_fields_set else {"sd": config.water.current_sd_mps}
+    return prior | {"streams": (WATER_LAYER, "thruster", "dvl_water")}
 
 
 def _knot(k: int, config: Any, entry: Any) -> dict[str, Any]:

@@ -350,7 +350,7 @@ class Water(ConfigSection):
     knots: Annotated[int, Field(ge=1, le=len(LAYERS))] | None = Field(
         None,
         description="knots of the current that are kept about the vehicle's depth; null = as many as the log's cells "
-        "reach over; 1 = one current for all depths, calibration.current",
+        "reach over; 1 = calibration.current alone, which changes as the depth does",
     )
     knot_m: Positive = Field(10.0, description="depth from one knot to the next, at least")
     current_sd_mps: Positive = Field(0.3, description="sd of the current at any depth, north and east")

@@ -218,7 +218,7 @@ class Assembly:
             while back and not (events[back:upto, at.SENSOR] == self._which[WATER_LAYER]).any():
                 back = max(back - (upto - back), 0)
             before = back + np.flatnonzero(events[back:upto, at.SENSOR] == self._which[WATER_LAYER])
-            first = int(events[before[-1], -self._context + FIRST_KNOT]) if len(before) else None
+            first = float(events[before[-1], -self._context + FIRST_KNOT]) if len(before) else None
             imu = self._table[:0] if self._no_imu else self._table
             made = layers.of(Stream(CELLS, (), time, data, row), imu, first, self._left_out)
             for t, values, line in zip(made.time.tolist(), made.data, made.row.tolist(), strict=True):

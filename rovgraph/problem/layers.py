@@ -6,7 +6,8 @@ linear between them, each a random walk in time, and from knot to knot a first-o
     u_j = exp(-h / L) u_i + w,  var w = s^2 (1 - exp(-2 h / L)),  i next to j                       (Gelb 1974, 3.8)
 
 A window of K knots about the vehicle is kept, knot j in the place j mod K. As the vehicle descends, the window moves:
-a knot that is left behind makes room for a new one, which is drawn from its neighbour. So the dive stays a chain.
+a knot that is left behind makes room for a new one, which is drawn from its neighbour. So the dive stays a chain. With
+one knot, the current is that at the middle of the cells, and follows from what it was where the vehicle came from.
 
 The cells of a profile, y = Phi (v - u), share the vehicle's velocity v; Phi has the weights of the knots u in each
 cell, whose sum is 1. The square-root information of the cells, R with R' R = Phi' W Phi, has two entries in a row, next
@@ -30,6 +31,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement, Stream
 from rovgraph.model.calibration import LAYERS, LAYOUT, WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.config_sections import Water
 from rovgraph.problem.problem import Problem
 from rovgraph.sensors.dvl_beam import BeamGeometry, beam_geometry
 from rovgraph.sensors.sensor import LARGEST_SD
@@ -43,6 +45,7 @@ REMEMBERED_S = 120.0  # of depth and altitude, online
 SETTLED_S = 1.0  # after the start of a dive from which on profiles count
 TOGETHER_S = 1e-4  # stamps of the cells of one profile
 SAME_M = 1e-6  # depths that differ by rounding
+LONE_STEP = 0.1  # of the depth, in knots, from which on the only knot follows
 FILLED = 1e-9  # part of a knot's weight below which no cell is near it
 OUT_OF_SIGHT = 1e3  # sd by which what stood in a knot's place before is forgotten [m/s]
 BESIDE, UNLIKE_SD = 2, 6.0  # cells on each side that a cell is compared with, and how far it may be off
@@ -182,7 +185,7 @@ class WaterLayers:
                 self._signals[sensor] = streams[sensor].time.tolist(), streams[sensor].data[:, 0].tolist()
         return [self.of(streams[CELLS], imu, None, left_out)]
 
-    def of(self, cells: Stream, imu: Array, first: int | None, left_out: Left) -> Stream:
+    def of(self, cells: Stream, imu: Array, first: float | None, left_out: Left) -> Stream:
         """Measurements of layers: components, their sd, context and number of the layer, shape (k, 7 + LAYER_WIDTH).
 
         Parameters
@@ -206,8 +209,8 @@ class WaterLayers:
         return Stream(WATER_LAYER, (), np.array(time), np.concatenate(rows), np.array(lines, np.int64))
 
     def _profile(
-        self, time: float, data: Array, imu: Array, first: int | None, left_out: Left
-    ) -> tuple[Array, int | None]:
+        self, time: float, data: Array, imu: Array, first: float | None, left_out: Left
+    ) -> tuple[Array, float | None]:
         """Measurements of one profile, and the uppermost knot."""
         empty, depth = np.empty((0, 7 + at.LAYER_WIDTH)), self._depth(time)
         if math.isnan(depth):
@@ -226,7 +229,9 @@ class WaterLayers:
         head, spacing, K = depth + float(self._below_sensor @ down_b), self.config.water.knot_m, len(self._places)
         place = (head + cells.down) / spacing
         if K == 1:
-            return self._rows(np.zeros(len(place)), cells, -1), first
+            middle = float(place.mean())
+            first = first if first is not None and abs(middle - first) < LONE_STEP else middle
+            return self._rows(np.zeros(len(place)), cells, first), first
         low, high = math.floor(place.min()), math.floor(place.max()) + 1
         first = low if first is None else min(max(first, high - K + 1), low)
         within = place < first + K - 1
@@ -283,18 +288,20 @@ class WaterLayers:
         if n > BESIDE:
             order = np.argsort(cells.down)
             vertical = cells.velocity[order] @ down_s
-            padded = np.pad(vertical, BESIDE, constant_values=np.nan)
-            median = np.nanmedian([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            padded = np.pad(vertical, BESIDE, constant_values=np.inf)  # behind all others
+            nearby = np.sort([padded[k : k + n] for k in range(2 * BESIDE + 1)], axis=0)
+            count, each = np.isfinite(nearby).sum(axis=0), np.arange(n)
+            median = 0.5 * (nearby[(count - 1) // 2, each] + nearby[count // 2, each])
             sd = self._relative(cells.sd[order]) * self.config.water.cell_sd_mps[2]
             alike[order] = np.abs(vertical - median) <= UNLIKE_SD * sd
         return alike
 
-    def _rows(self, place: Array, cells: Cells, first: int) -> Array:
+    def _rows(self, place: Array, cells: Cells, first: float) -> Array:
         """At most one measurement between two knots; ``place`` is the depth of each cell in knots."""
         believed, rho = np.array(self.config.water.cell_sd_mps), self.config.water.cell_correlation
         relative = self._relative(cells.sd)
         K = len(self._places)
-        above = np.floor(place).astype(np.int64) - first if K > 1 else np.zeros(len(place), np.int64)
+        above = np.floor(place).astype(np.int64) - int(first) if K > 1 else np.zeros(len(place), np.int64)
         share, weight = place - np.floor(place), 1.0 / np.square(relative)
         here, below, right = np.zeros(K), np.zeros(K), np.zeros((K + 1, 3))
         np.add.at(here, above, weight * (1.0 - share) ** 2)
@@ -313,7 +320,7 @@ class WaterLayers:
             root = math.sqrt(pivot)
             q = (right[k] - before * q) / root
             before = below[k] / root
-            total, knot = root + before, first + k
+            total, knot = root + before, int(first) + k
             context = np.zeros(at.LAYER_WIDTH)
             context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
             context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
@@ -370,10 +377,19 @@ def by_mapped_beams(along: Array, far: Array, down: Array, head: BeamGeometry, d
 
 
 class NewKnot(NamedTuple):
-    """A knot that takes another's place: the variables of both, and of its neighbour, None where it has none."""
+    """A knot that takes another's place.
+
+    Attributes
+    ----------
+    name : the variable
+    neighbour : that it follows from; its own name: what it was before; None: nothing
+    kept, sd : of the neighbour's deviation from its mean, and what is added [m/s]
+    """
 
     name: str
     neighbour: str | None
+    kept: float
+    sd: float
 
 
 def put_windows(keyframes: Array, rows: Array, of: NDArray[np.int64], layer: int, begin: int, context: int) -> None:
@@ -407,22 +423,31 @@ def window_changes(problem: Problem) -> NDArray[np.int64]:
     return np.flatnonzero((first[1:] != first[:-1]) & np.isfinite(first[1:])) + 1
 
 
-def new_knots(problem: Problem, k: int, count: int) -> list[NewKnot]:
-    """Knots that are new at keyframe k, each after its neighbour, of ``count`` that are kept."""
-    before, now = problem.keyframes[k - 1 : k + 1, assembly.FIRST_KNOT].tolist()
-    if count < 2 or now == before or math.isnan(now):
+def new_knots(problem: Problem, k: int, water: Water) -> list[NewKnot]:
+    """Knots that are new at keyframe k, each after its neighbour."""
+    first = problem.keyframes[:, assembly.FIRST_KNOT]
+    if k == 0 or first[k] == first[k - 1] or math.isnan(first[k]):
         return []
-    first = int(now)
+    count, before, now = water.knots or len(LAYERS), float(first[k - 1]), float(first[k])
+    if count == 1:
+        return [] if math.isnan(before) else [NewKnot("current", "current", *_conditional(water, abs(now - before)))]
+    top = int(now)
     if not abs(now - before) < count:  # never where that is nan
-        chain = [(first, None), *((j, j - 1) for j in range(first + 1, first + count))]
+        chain = [(top, None), *((j, j - 1) for j in range(top + 1, top + count))]
     elif now > before:
-        chain = [(j, j - 1) for j in range(int(before) + count, first + count)]
+        chain = [(j, j - 1) for j in range(int(before) + count, top + count)]
     else:
-        chain = [(j, j + 1) for j in range(int(before) - 1, first - 1, -1)]
-    return [NewKnot(LAYERS[j % count], None if i is None else LAYERS[i % count]) for j, i in chain]
+        chain = [(j, j + 1) for j in range(int(before) - 1, top - 1, -1)]
+    follows, alone = _conditional(water), (0.0, water.current_sd_mps)
+    return [
+        NewKnot(LAYERS[j % count], None, *alone)
+        if i is None
+        else NewKnot(LAYERS[j % count], LAYERS[i % count], *follows)
+        for j, i in chain
+    ]
 
 
-def conditional(config: Config) -> tuple[float, float]:
-    """What a knot keeps of its neighbour, and the sd that is added [m/s]."""
-    kept = math.exp(-config.water.knot_m / config.water.correlation_m)
-    return kept, config.water.current_sd_mps * math.sqrt(1.0 - kept**2)
+def _conditional(water: Water, apart: float = 1.0) -> tuple[float, float]:
+    """What a knot keeps of another, so many knots ``apart``, and the sd that is added [m/s]."""
+    kept = math.exp(-apart * water.knot_m / water.correlation_m)
+    return kept, water.current_sd_mps * math.sqrt(1.0 - kept**2)

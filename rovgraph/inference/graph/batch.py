@@ -10,7 +10,7 @@ that the chain uses. Calibration that walks has a value at each keyframe, as in 
 
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
@@ -37,11 +37,13 @@ from rovgraph.inference.graph.values import (
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.motion_residual import motion_errors
 from rovgraph.kernels.states import States
-from rovgraph.model.calibration import LAYERS, TABLE, Belief
+from rovgraph.model.calibration import TABLE, Belief
 from rovgraph.model.config import Config
+from rovgraph.model.config_sections import Water
 from rovgraph.model.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 from rovgraph.problem.calibration_roles import CalibrationRoles, unknowns
 from rovgraph.problem.initial_conditions import StatePrior
+from rovgraph.problem.layers import NewKnot, new_knots
 from rovgraph.problem.measurements import (
     Measurements,
     Seen,
@@ -58,14 +60,6 @@ from rovgraph.sensors.instruments import Instrument
 
 Factor = gtsam.NonlinearFactor
 ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
-
-
-def refuse_layers(unknowns: CalibrationRoles) -> None:
-    """Raise InputError where the current has layers: a new knot would not follow from its neighbour here."""
-    if LAYERS[0] in unknowns.estimated:
-        raise InputError(
-            "GTSAM and iSAM2 do not take profiles of the water; state water.use: false, or leave these estimators out"
-        )
 
 
 def priors(prior: StatePrior, beliefs: Mapping[str, Belief], unknowns: CalibrationRoles) -> list[Factor]:
@@ -93,16 +87,25 @@ def landmark_prior(number: int) -> Factor:
     )
 
 
-def drift(unknowns: CalibrationRoles, index: int, duration: float) -> list[Factor]:
-    """The walk of calibration variables to a value from the one before, over ``duration`` [s]."""
-    return [] if index == 0 else [_walk(unknowns, name, index, duration) for name in unknowns.begun_by(index)]
+def drift(unknowns: CalibrationRoles, index: int, duration: float, knots: Sequence[NewKnot] = ()) -> list[Factor]:
+    """The walk of calibration variables to a value from the one before, over ``duration`` [s], and ``knots`` there."""
+    new = {knot.name: knot for knot in knots}
+    begun = unknowns.begun_by(index) if index else ()
+    return [_walk(unknowns, name, index, duration, new.get(name)) for name in begun]
 
 
-def _walk(unknowns: CalibrationRoles, name: str, index: int, duration: float) -> Factor:
-    """Whitened, ``x' - mean = kept (x - mean)``."""
+def _walk(unknowns: CalibrationRoles, name: str, index: int, duration: float, knot: NewKnot | None) -> Factor:
+    """Whitened, ``x' - mean = kept (x - mean)``; of a new knot, x is its neighbour."""
     mean, (kept, sd) = unknowns.fixed[name], unknowns.walked(name, duration)
     here, there = calibration_key(unknowns, name, index), calibration_key(unknowns, name, index - 1)
-    if name not in unknowns.time_constants:
+    if knot is not None and knot.neighbour is None:
+        return gtsam.PriorFactorVector(here, mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), knot.sd))
+    if knot is not None and knot.neighbour == name:
+        kept, sd = kept * knot.kept, np.hypot(kept * knot.sd, sd)
+    elif knot is not None:
+        kept, sd = np.array(knot.kept), np.array(knot.sd)
+        there = calibration_key(unknowns, str(knot.neighbour), index)
+    elif name not in unknowns.time_constants:
         return gtsam.BetweenFactorVector(there, here, 0.0 * mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), sd))
     weight, origin = np.eye(len(mean)) / sd, gtsam.Values()
     origin.insert(here, np.zeros(len(mean)))
@@ -419,8 +422,7 @@ def make_graph(
     """
     index = np.arange(len(problem))
     wanted = wanted or unknowns(beliefs, problem.used)
-    refuse_layers(wanted)
-    factors = _others(problem, prior, beliefs, wanted, index)
+    factors = _others(problem, prior, config.water, beliefs, wanted, index)
     blocks = measurements_of(problem, instruments, instruments, gravity(config), wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
@@ -433,6 +435,7 @@ def make_graph(
 def _others(
     problem: Problem,
     prior: StatePrior,
+    water: Water,
     beliefs: Mapping[str, Belief],
     wanted: CalibrationRoles,
     index: NDArray[np.int64],
@@ -442,7 +445,8 @@ def _others(
     factors += [motion_factor(problem, k, wanted, int(index[k])) for k in range(1, len(problem))]
     begun = np.flatnonzero(np.diff(index, prepend=-1))
     for before, after in pairwise(begun.tolist()):
-        factors += drift(wanted, int(index[after]), float(problem.time[after] - problem.time[before]))
+        knots = new_knots(problem, after, water)
+        factors += drift(wanted, int(index[after]), float(problem.time[after] - problem.time[before]), knots)
     return factors
 
 

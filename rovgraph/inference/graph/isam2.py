@@ -42,7 +42,7 @@ from rovgraph.inference.faulty_intervals import Searches
 from rovgraph.inference.filter import ORIGIN, FilterEngine
 from rovgraph.inference.filter_step import FilterGates, FilterStep, Gaussian, Met, states_of
 from rovgraph.inference.gauss_newton import Gates
-from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate, refuse_layers
+from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate
 from rovgraph.inference.graph.places import associated_optimum, resolved
 from rovgraph.inference.graph.values import CALIBRATION, key
 from rovgraph.inference.lever_arm_bias import without_noise_of_rates
@@ -53,7 +53,7 @@ from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion_residual import motion_errors
 from rovgraph.kernels.states import States
 from rovgraph.log import Measurement
-from rovgraph.model.calibration import LAYOUT, TABLE, Belief
+from rovgraph.model.calibration import LAYOUT, TABLE, WATER_LAYER, Belief
 from rovgraph.model.gauss_markov import walked
 from rovgraph.model.state import PLACE, PLACE_DIM, POSE, State
 from rovgraph.problem.assembly import assembly_of
@@ -111,20 +111,23 @@ class IntervalTerms:
     filter : with the equations
     problem, k : the interval that ends with keyframe k
     let_in : ndarray of int, its measurements that count
+    segment : of time that it lies in
 
     Attributes
     ----------
-    problem, k : the same
-    segment : of time that it lies in
+    problem, k, segment : the same
     landmarks : measurements of places
     before, here : at the keyframe before, and at the one that ends the interval, where there are any
     """
 
-    def __init__(self, filter: FilterEngine, problem: Problem, k: int, let_in: Index) -> None:
-        self.problem, self.k, self.segment = problem, k, int(problem.keyframes[k, SEGMENT])
+    def __init__(self, filter: FilterEngine, problem: Problem, k: int, let_in: Index, segment: int) -> None:
+        self.problem, self.k, self.segment = problem, k, segment
         seen = problem.number[let_in] >= 0
         self.landmarks, others = let_in[seen].tolist(), let_in[~seen]
         here = problem.keyframe[others] == k
+        if any(knot.name != knot.neighbour for knot in filter.new_knots(problem, k)):  # those before do not know them
+            known = here | (problem.which[others] != problem.sensors.index(WATER_LAYER))
+            others, here = others[known], here[known]
         self.before = KeyframeTerms(filter, problem, others[~here]) if not here.all() else None
         self.here = KeyframeTerms(filter, problem, others[here]) if here.any() else None
 
@@ -144,7 +147,6 @@ class Linearization:
     """
 
     def __init__(self, filter: FilterEngine, prior: StatePrior) -> None:
-        refuse_layers(filter.unknowns)
         self._prior = prior
         self._prior_weight = np.linalg.inv(np.linalg.cholesky(prior.covariance()))
         self._size = filter.layout.size
@@ -277,7 +279,7 @@ class Incremental:
         let_in : of its measurements, those that count
         numbers : of the places that all measurements so far are of, -1 where they are of none
         """
-        term = IntervalTerms(self._filter, problem, k, let_in)
+        term = IntervalTerms(self._filter, problem, k, let_in, self._segment(problem, k))
         if term.segment == len(self._c):
             self._c.append(known.c)
             self._begun.append(k)
@@ -285,6 +287,13 @@ class Incremental:
         self._x.append(known.x)
         self._numbers = numbers
         self._push(k)
+
+    def _segment(self, problem: Problem, k: int) -> int:
+        """Of time, that an interval lies in: one begins where knots of the current are new, too."""
+        if k == 0:
+            return 0
+        before, here = problem.keyframes[k - 1 : k + 1, SEGMENT].tolist()
+        return self._terms[k - 1].segment + int(here != before or bool(self._filter.new_knots(problem, k)))
 
     def update(self) -> None:
         """Take what has been added.
@@ -385,7 +394,10 @@ class Incremental:
         for sensor, admitted in let_in.items():
             kept[problem.of_sensor(sensor)] = admitted
         every = (np.arange(*problem.measured_in(k)) for k in range(len(problem)))
-        self._terms = [IntervalTerms(self._filter, problem, k, rows[kept[rows]]) for k, rows in enumerate(every)]
+        self._terms = [
+            IntervalTerms(self._filter, problem, k, rows[kept[rows]], term.segment)
+            for k, (rows, term) in enumerate(zip(every, self._terms, strict=True))
+        ]
         self._numbers = problem.number
         self._x, self._c, self._places = list(x), [c[begun] for begun in self._begun], {}
         self._restart()
@@ -423,7 +435,7 @@ class Incremental:
             index, s = term.k, segments[k]
             factors = [_interval_factor(index, s, rows), *self._landmarks(term, x[k : k + 2], c[k])]
             if self._begun[s] == index:
-                factors.append(self._calibration_factor(s, term.time))
+                factors.append(self._calibration_factor(s, term))
                 self._insert(key(CALIBRATION, s), len(self._parts))
             self._insert(key(POSE, index), MOTION)
             for factor in factors:
@@ -435,26 +447,42 @@ class Incremental:
         if not self._engine.valueExists(name):
             self._values.insert(name, np.zeros(dim))
 
-    def _calibration_factor(self, s: int, time: float) -> gtsam.JacobianFactor:
-        """The prior of the first segment's calibration, or the walk to a segment from the one before."""
+    def _calibration_factor(self, s: int, first: IntervalTerms) -> gtsam.JacobianFactor:
+        """The prior of the first segment's calibration, or the walk to a segment from the one before.
+
+        ``first`` is the segment's first interval, with which knots of the current may be new.
+        """
         calibration_key, here = key(CALIBRATION, s), self._c[s][self._parts]
         if s == 0:
             return gtsam.JacobianFactor(
                 calibration_key, np.diag(1.0 / self._sd), (self._mean - here) / self._sd, _unit(len(here))
             )
-        duration = time - self._terms[self._begun[s - 1]].time
-        kept, sd = walked(self._walk, self._time_constant, duration)
-        off = (self._mean + kept * (self._c[s - 1][self._parts] - self._mean) - here) / sd
-        return gtsam.JacobianFactor(
-            key(CALIBRATION, s - 1), -np.diag(kept / sd), calibration_key, np.diag(1.0 / sd), off, _unit(len(here))
-        )
+        kept, sd = walked(self._walk, self._time_constant, first.time - self._terms[self._begun[s - 1]].time)
+        before, own = np.diag(kept), np.eye(len(here))  # own x' = before x + w, in deviations from the means
+        for name, neighbour, of_neighbour, added in self._filter.new_knots(first.problem, first.k):
+            place = self._part(name)
+            if neighbour == name:
+                before[place] *= of_neighbour
+                sd[place] = np.hypot(kept[place] * added, sd[place])
+                continue
+            before[place], sd[place] = 0.0, added
+            if neighbour is not None:
+                own[place, self._part(neighbour)] = -of_neighbour * np.eye(place.stop - place.start)
+        off = before @ (self._c[s - 1][self._parts] - self._mean) - own @ (here - self._mean)
+        before, own = before / sd[:, None], own / sd[:, None]
+        return gtsam.JacobianFactor(key(CALIBRATION, s - 1), -before, calibration_key, own, off / sd, _unit(len(here)))
+
+    def _part(self, name: str) -> slice:
+        """Place of an estimated variable among these."""
+        columns = self._filter.layout.columns[name]
+        return slice(columns.start - MOTION, columns.stop - MOTION)
 
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:
         """Factors of the places that are seen in an interval, and priors of those that are new; ``x`` of its ends."""
         factors = []
         for row in term.landmarks:
             number, keyframe = int(self._numbers[row]), int(term.problem.keyframe[row])
-            segment = int(term.problem.keyframes[keyframe, SEGMENT])
+            segment = self._terms[keyframe].segment
             block, here = self._filter.measurements(term.problem, np.array([row])), keyframe == term.k
             state = Gaussian(x[int(here)], c, np.empty((0, 0))).state
             name = key(PLACE, number)
