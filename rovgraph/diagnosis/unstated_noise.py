@@ -38,6 +38,7 @@ from rovgraph.log.units import behind, shown
 from rovgraph.model.calibration import AUTO, MOUNT, TABLE, WATER_LAYER
 from rovgraph.model.config import Config
 from rovgraph.problem.initial_conditions import Beliefs
+from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.rules import BENT, RULES
 
 
@@ -246,8 +247,8 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
 
 
 def _restless(best: ChainOptimum) -> UnstatedNoise | None:
-    """A current that changes faster than the configuration states."""
-    knots = knots_walking_faster(best)
+    """A current that changes faster than the configuration states; without an IMU errors of heading look like it."""
+    knots = {} if has_constant_velocity(best.initial.config) else knots_walking_faster(best)
     if not knots:
         return None
     walk = next(iter(knots.values())).walk

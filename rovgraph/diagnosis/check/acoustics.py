@@ -485,7 +485,7 @@ def _unit_of_lengths(log: Log, config: Config, errors: Array, seen: Sightings) -
     by_range = bool(np.isfinite(log["usbl"]["usbl_range"]).any())
     if not by_range and np.isnan(log["usbl"]["usbl_x"]).all():
         return None
-    off = {}
+    off: dict[tuple[str, str], float] = {}
     for unit, factor in UNITS["length"].items():
         tried = {
             "usbl_range" if by_range else "usbl": errors - (1.0 - factor) * down,
