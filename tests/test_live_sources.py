@@ -259,7 +259,7 @@ def test_a_line_says_what_the_row_of_a_log_would(heard):
     found = {r.sensor: r.values for r in message.readings}
     np.testing.assert_allclose(found["imu"], [1, 2, -9.8, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(found["depth"], [3.0])
-    np.testing.assert_allclose(found[GEODETIC], [1.0, 2.0, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(found[GEODETIC], [1.0, 2.0, *4 * [np.nan]])
     assert set(found) == {"imu", "depth", GEODETIC}
     assert heard.kinds == {"incomplete": 1}
 
@@ -893,7 +893,7 @@ def test_fixes_in_degrees_are_replayed_in_degrees(tmp_path):
     assert all(m.readings[0].sensor == GEODETIC for m in messages)
     np.testing.assert_allclose(
         [m.readings[0].values for m in messages],
-        [[58.3, 15.1, 2, 3, -1.5], [58.31, 15.2, np.nan, np.nan, np.nan]],
+        [[58.3, 15.1, 2, 3, -1.5, np.nan], [58.31, 15.2, *4 * [np.nan]]],
         atol=1e-9,
     )
 

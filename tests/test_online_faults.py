@@ -370,7 +370,7 @@ def test_thruster_signals_are_used_whenever_they_begin():
 def test_fixes_that_begin_late_say_where_the_vehicle_is():
     config = falcon(fix={"sd_m": 0.5}).model_copy(update={"start": Config().start})
     case = simulated(config, 60.0, seed=1, dvl_rate=4.0, fix_interval=1.0)
-    away = np.array([300.0, -200.0, 0.0, 0.0, 0.0])
+    away = np.array([300.0, -200.0, 0.0, 0.0, 0.0, 0.0])
 
     def alter(m: Measurement) -> list[Measurement]:
         return [m] if m.sensor != "fix" else [m._replace(values=m.values + away)] if m.time > 25.0 else []

@@ -282,7 +282,8 @@ def test_every_unit_has_the_factor_that_pint_has():
         "g": "standard_gravity", "mg": "millistandard_gravity", "m/s2": "meter / second ** 2",
         "m/s^2": "meter / second ** 2", "mrad/s": "milliradian / second", "deg/s": "degree / second",
         "uT": "microtesla", "nT": "nanotesla", "mG": "milligauss", "gauss": "gauss", "us": "microsecond",
-        "degE7": "1e-7 degree", "m2": "meter ** 2", "cm2": "centimeter ** 2", "mm2": "millimeter ** 2",
+        "degE7": "1e-7 degree", "m2": "meter ** 2",
+        "ft2": "foot ** 2", "cm2": "centimeter ** 2", "mm2": "millimeter ** 2",
     }  # fmt: skip
     for kind, factors in UNITS.items():
         for unit, factor in factors.items():

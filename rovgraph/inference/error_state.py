@@ -136,8 +136,9 @@ class FilterHistory:
     def _columns(self, known: Sequence[Gaussian], keyframes: Array) -> Columns:
         """Of as many keyframes."""
         size, P = self._engine.layout.size, [one.covariance for one in known]
-        x, c, sd = np.array([k.x for k in known]), np.array([k.c for k in known]), np.array([*map(np.diagonal, P)])
-        return self._reduced(x, c, np.array([own[:MOTION, :MOTION] for own in P]), np.sqrt(sd[:, :size]), keyframes)
+        x, c = np.array([k.x for k in known]), np.array([k.c for k in known])
+        sd = np.sqrt([np.diagonal(own)[:size] for own in P])
+        return self._reduced(x, c, np.array([own[:MOTION, :MOTION] for own in P]), sd, keyframes)
 
     def _reduced(self, x: Array, c: Array, P: Array, sd: Array, keyframes: Array) -> Columns:
         """From the covariance of pose, velocity and bias, shape (n, 15, 15)."""

@@ -158,7 +158,7 @@ class Level(NamedTuple):
     force_b, rate_b : ndarray, shape (3,), mean specific force in the axes of the first sample, mean rate
     quiet : whether it stands still
     seconds : that there are
-    shows_bias : whether the mean rate is the gyro's bias: that of a better gyro is the Earth's
+    shows_bias : whether the mean rate, less the Earth's where it is modelled, shows the bias better than it is known
     """
 
     force_b: Array
@@ -190,7 +190,8 @@ def level(log: Log, config: Config) -> Level:
         and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * bias_sd + EARTH_RATE
     )
     if quiet and not _moves(log):
-        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds, seconds >= 1.0 and bool(bias_sd > EARTH_RATE))
+        turns = EARTH_RATE * (np.deg2rad(config.start.heading_sd_deg) if config.environment.earth_rotation else 1.0)
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds, seconds >= 1.0 and bool(bias_sd > turns))
     return Level(rotate(turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
 
 

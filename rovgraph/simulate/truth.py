@@ -11,7 +11,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.model.calibration import LAYERS, Belief
+from rovgraph.model.calibration import CHART_PLACE, LAYERS, Belief
 from rovgraph.model.config import Config, beliefs
 from rovgraph.model.gauss_markov import stationary_walk, walked
 from rovgraph.model.thesis import R_DVL, R_MTI, SAMPLE_S
@@ -188,4 +188,4 @@ class Truth:
 
 def of_waves(belief: Belief) -> bool:
     """Whether a variable stands for what waves do, which is in a simulated path, or for what is not simulated."""
-    return belief.variable.name in ("water_oscillation", *LAYERS)
+    return belief.variable.name in ("water_oscillation", *LAYERS, CHART_PLACE)
