@@ -515,13 +515,6 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     return config.with_values(calibration=entries)
 
 
-def with_calibration(config: Config, name: str, stated: Mapping[str, object]) -> Config:
-    """The configuration with other keys of a calibration variable."""
-    given = config.calibration
-    entry = getattr(given, name).model_copy(update=dict(stated))
-    return config.model_copy(update={"calibration": given.model_copy(update={name: entry})})
-
-
 def load_config(path: Path | str | None = None) -> Config:
     """Read a YAML configuration; without a path, all defaults.
 
