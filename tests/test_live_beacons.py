@@ -86,6 +86,15 @@ def test_ranges_that_fit_no_place_are_never_clear():
     assert not sides(shuffled, *DOWN)[0].is_clear(shuffled)
 
 
+@pytest.mark.parametrize("wander", [0.0, 0.003, 0.01, 0.03])
+def test_ranges_from_one_spot_leave_the_whole_circle_and_fit_it(wander):
+    rng = np.random.default_rng(2)
+    spot = np.cumsum(rng.normal(0.0, wander / np.sqrt(48.0), (48, 3)), axis=0)
+    for place in sides(ranged(spot, spot), *DOWN):
+        assert place.sd > 50.0 and place.outliers < 0.1 and not place.is_clear(ranged(spot, spot))
+        assert np.linalg.norm(place.place - spot[0]) == pytest.approx(np.linalg.norm(BEACON - spot[0]), abs=0.3)
+
+
 def live(dive, seconds: float, named: float | None = None) -> SimpleNamespace:
     """A replay up to a time: navigator, solutions once a second, events."""
     log, config = campaign_log(dive)

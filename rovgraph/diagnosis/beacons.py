@@ -297,6 +297,7 @@ def _with_drift(place: Array, ranges: RangesAlongTrack, down: float, down_sd: fl
     common = ranges.scale_sd**2 * np.outer(ranges.length, ranges.length) + ranges.offset_sd**2
     common += 0.5 * down_sd**4 / np.outer(ranges.length, ranges.length)  # of a beacon as deep as the vehicle
     weight, prior = np.ones(len(sd)), np.diag([0.0, 0.0, down_sd**-2])
+    near = np.eye(3) / around(ranges.length) ** 2  # on the spot a step along the circle about it would leave it
     for k in range(STEPS + 1):
         away = place - ranges.p_n
         d = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
@@ -307,7 +308,8 @@ def _with_drift(place: Array, ranges: RangesAlongTrack, down: float, down_sd: fl
         noise = sd * by_r[:, 0] / weight  # of each range, in its sds
         weight = np.maximum(1.0 / (1.0 + (noise / TUKEY) ** 2), 1e-6)
         N = u.T @ by_u + prior
-        step = np.linalg.solve(N + 1e-9 * np.eye(3), u.T @ by_r[:, 0] - prior @ (place - [0.0, 0.0, down]))
+        gradient = u.T @ by_r[:, 0] - prior @ (place - [0.0, 0.0, down])
+        step = np.linalg.solve(N + near, gradient)
         length = float(np.linalg.norm(step))
         if k == STEPS or length < 1e-2:
             break
