@@ -152,8 +152,17 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
         down, down_sd = depth_of_bottom(beacon.down_m, there.p_n, altitude)
         places = _trilaterate(there.p_n, length, sd, down, down_sd or beacon.down_sd_m)
         other = next((p for p, cost in places[1:] if cost - places[0][1] < RUNNER_UP), None)
-        out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, around(length), down_sd))
+        begin_sd = _sd_to_begin(places[0][0], there.p_n, length, sd, down_sd or beacon.down_sd_m)
+        out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, begin_sd, down_sd))
     return out
+
+
+def _sd_to_begin(place: Array, p_n: Array, length: Array, sd: Array, down_sd: float) -> float:
+    """An sd that holds a beacon about a place: where ranges from one spot leave a circle, as wide as that [m]."""
+    away = (place - p_n) / (np.linalg.norm(place - p_n, axis=1) * sd)[:, None]
+    known = np.linalg.inv(away.T @ away + np.diag([1e-9, 1e-9, down_sd**-2]))[:2, :2]
+    along = float(np.sqrt(np.linalg.eigvalsh(known)[-1]))
+    return max(around(length), min(along, float(np.median(length))))
 
 
 def around(length: Array) -> float:
