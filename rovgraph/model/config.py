@@ -568,7 +568,7 @@ def merged(stated: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 def _parse_config(data: dict[str, Any], source: str) -> Config:
     compatibility.refuse_newer(data.get("version"), compatibility.CONFIGURATION, f"{source}: configuration")
-    config = parse_model(Config, data, source)
+    config = parse_model(Config, compatibility.with_keys_of_today(data), source)
     warn_of_mixed_grades(config.imu, source)
     return config
 
