@@ -4,6 +4,9 @@ A file that states no version is of version 1. A checkpoint has its own number (
 since only the version that wrote it can go on with it.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from rovgraph.errors import InputError
 
 CONFIGURATION = 1  # key `version` of a configuration
@@ -26,3 +29,15 @@ def refuse_newer(stated: object, known: int, what: str) -> None:
     """
     if isinstance(stated, int | float) and stated > known:
         raise InputError(f"{what} of version {stated:g}, this rovgraph reads up to {known}; update rovgraph")
+
+
+def with_keys_of_today(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys and values of a configuration, with those that have gone under their present names."""
+    out, chart = dict(data), data.get("chart")
+    if isinstance(chart, Mapping) and "position_sd_m" in chart:
+        out["chart"] = {key: value for key, value in chart.items() if key != "position_sd_m"}
+        sd, stated = chart["position_sd_m"], data.get("calibration") or {}
+        place = {"sd": sd} if sd else {"estimate": False}
+        if isinstance(stated, Mapping):
+            out["calibration"] = {"chart_place": place, **stated}
+    return out

@@ -55,6 +55,20 @@ def test_a_configuration_of_this_version_or_without_one_is_read_and_written_with
     assert written.startswith(f"version: {CONFIGURATION}\n") and rg.parse_config(written).name == "a"
 
 
+@pytest.mark.parametrize(
+    ("text", "sd", "estimate"),
+    [
+        ("chart: {sd_m: 0.3, position_sd_m: 2.5}", 2.5, True),
+        ("chart: {position_sd_m: 0}", 1.0, False),
+        ("{chart: {position_sd_m: 2.5}, calibration: {chart_place: {sd: 4}}}", 4.0, True),
+    ],
+)
+def test_the_place_of_a_chart_is_read_under_its_former_key(text, sd, estimate):
+    config = rg.parse_config(text)
+    assert (config.calibration.chart_place.sd, config.calibration.chart_place.estimate) == (sd, estimate)
+    assert "position_sd_m" not in config.to_yaml().partition("\nchart:")[2].partition("\n")[0]
+
+
 def test_a_newer_configuration_is_refused_by_its_version_and_not_by_its_keys(tmp_path, refused):
     path = tmp_path / "vehicle.yaml"
     path.write_text(f"version: {CONFIGURATION + 1}\nsonar: {{range_m: 30}}\n")

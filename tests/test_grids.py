@@ -12,13 +12,14 @@ from wire import Heard
 import rovgraph as rg
 from rovgraph.diagnosis.check.fixes import track
 from rovgraph.errors import InputError
+from rovgraph.inference.initialise import initialise
 from rovgraph.inference.resolve import convergence
 from rovgraph.live.message import GEODETIC
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.source import Chunk
 from rovgraph.log import Log
 from rovgraph.model.config import Config
-from rovgraph.model.grids import convergence_and_scale, utm_zone
+from rovgraph.model.grids import convergence_and_scale, grid_columns, utm_zone
 from rovgraph.simulate import Style
 from rovgraph.simulate.path import CALM
 
@@ -69,6 +70,7 @@ def test_a_grid_that_is_not_stated_or_has_no_such_place_is_refused() -> None:
     for grid, frame, said in (
         ("EPSG:99999", table(), "is not known"),
         ("EPSG:4326", table(), "is in degrees, no grid"),
+        ("EPSG:4978", table(), "WGS 84 is no grid"),
         (GRID, swapped, "has no place with easting"),
     ):
         with pytest.raises(InputError, match=said):
@@ -95,6 +97,16 @@ def case() -> Simulated:
         noise=False,
         style=Style(waves=CALM),
     )
+
+
+def test_a_grid_of_another_zone_is_told_once_and_not_for_each_track(case: Simulated) -> None:
+    config = changed(case.config, environment={"origin_lat_deg": 42.0, "origin_lon_deg": 3.0, "grid": "EPSG:32755"})
+    log = Log.from_frame(case.dive.log_frame, config)
+    with pytest.warns(rg.DataWarning, match="UTM zone 55S is not made for") as told:
+        initialise(log, config)
+        for _ in range(3):
+            grid_columns("EPSG:32755", np.array([42.0]), np.array([3.0]))
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from dives import campaign_log
 
-from rovgraph.diagnosis.beacons import RangesAlongTrack, ambiguous, sides
+from rovgraph.diagnosis.beacons import RangesAlongTrack, _sd_to_begin, ambiguous, around, sides
 from rovgraph.inference.initialise import initialise
 from rovgraph.live.beacons import UnplacedBeacons
 from rovgraph.live.clocks import Clocks
@@ -84,6 +84,22 @@ def test_ranges_that_fit_no_place_are_never_clear():
     ranges = ranged(corner(), corner())
     shuffled = replace(ranges, length=np.random.default_rng(3).uniform(50.0, 300.0, len(ranges.length)))
     assert not sides(shuffled, *DOWN)[0].is_clear(shuffled)
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.003, 0.01, 0.03])
+def test_ranges_from_one_spot_leave_the_whole_circle_and_fit_it(wander):
+    rng = np.random.default_rng(2)
+    spot = np.cumsum(rng.normal(0.0, wander / np.sqrt(48.0), (48, 3)), axis=0)
+    for place in sides(ranged(spot, spot), *DOWN):
+        assert place.sd > 50.0 and place.outliers < 0.1 and not place.is_clear(ranged(spot, spot))
+        assert np.linalg.norm(place.place - spot[0]) == pytest.approx(np.linalg.norm(BEACON - spot[0]), abs=0.3)
+
+
+def test_a_beacon_begins_as_wide_as_the_circle_that_one_spot_leaves():
+    for path, wide in ((np.zeros((48, 3)), True), (corner(), False)):
+        ranges = ranged(path, path)
+        sd = _sd_to_begin(BEACON, path, ranges.length, ranges.sd, DOWN[1])
+        assert sd == pytest.approx(np.median(ranges.length) if wide else around(ranges.length))
 
 
 def live(dive, seconds: float, named: float | None = None) -> SimpleNamespace:

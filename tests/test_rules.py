@@ -371,6 +371,17 @@ def test_separation_is_of_the_whole_dive(what, limit, times, severity):
     assert span_of(said[0]) == (0.0, SECONDS)
 
 
+@pytest.mark.parametrize("what", ["position", "depth", "heading"])
+def test_a_filter_that_lacks_what_the_smoother_considers_is_not_contradicted_by_that(what):
+    s = track(sd=0.2)
+    f = differing(track(sd=0.01), what, np.full(len(s), 0.1))
+    said = [one for one in motion.separation_of(s, f, START) if one.kind == "separation" and what in one.cause]
+    axes = 2.0 if what == "position" else 1.0
+    assert [(one.figure, one.severity) for one in said] == [(pytest.approx(0.25 / axes), None)]
+    (sure,) = (one for one in motion.separation_of(f, s, START) if one.kind == "separation" and what in one.cause)
+    assert sure.figure == pytest.approx(0.25 / axes)
+
+
 def differing(s: Trajectory, what: str, off: Array) -> Trajectory:
     if what == "heading":
         return replace(s, R_nb=matrix_from_rpy(np.column_stack([0.0 * off, 0.0 * off, off])))

@@ -152,8 +152,17 @@ def find_beacons(log: Log, problem: Problem, initial: InitialConditions) -> list
         down, down_sd = depth_of_bottom(beacon.down_m, there.p_n, altitude)
         places = _trilaterate(there.p_n, length, sd, down, down_sd or beacon.down_sd_m)
         other = next((p for p, cost in places[1:] if cost - places[0][1] < RUNNER_UP), None)
-        out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, around(length), down_sd))
+        begin_sd = _sd_to_begin(places[0][0], there.p_n, length, sd, down_sd or beacon.down_sd_m)
+        out.append(BeaconPlaces(str(beacon.name), k, places[0][0], other, begin_sd, down_sd))
     return out
+
+
+def _sd_to_begin(place: Array, p_n: Array, length: Array, sd: Array, down_sd: float) -> float:
+    """An sd that holds a beacon about a place: where ranges from one spot leave a circle, as wide as that [m]."""
+    away = (place - p_n) / (np.linalg.norm(place - p_n, axis=1) * sd)[:, None]
+    known = np.linalg.inv(away.T @ away + np.diag([1e-9, 1e-9, down_sd**-2]))[:2, :2]
+    along = float(np.sqrt(np.linalg.eigvalsh(known)[-1]))
+    return max(around(length), min(along, float(np.median(length))))
 
 
 def around(length: Array) -> float:
@@ -297,6 +306,7 @@ def _with_drift(place: Array, ranges: RangesAlongTrack, down: float, down_sd: fl
     common = ranges.scale_sd**2 * np.outer(ranges.length, ranges.length) + ranges.offset_sd**2
     common += 0.5 * down_sd**4 / np.outer(ranges.length, ranges.length)  # of a beacon as deep as the vehicle
     weight, prior = np.ones(len(sd)), np.diag([0.0, 0.0, down_sd**-2])
+    near = np.eye(3) / around(ranges.length) ** 2  # on the spot a step along the circle about it would leave it
     for k in range(STEPS + 1):
         away = place - ranges.p_n
         d = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
@@ -307,7 +317,8 @@ def _with_drift(place: Array, ranges: RangesAlongTrack, down: float, down_sd: fl
         noise = sd * by_r[:, 0] / weight  # of each range, in its sds
         weight = np.maximum(1.0 / (1.0 + (noise / TUKEY) ** 2), 1e-6)
         N = u.T @ by_u + prior
-        step = np.linalg.solve(N + 1e-9 * np.eye(3), u.T @ by_r[:, 0] - prior @ (place - [0.0, 0.0, down]))
+        gradient = u.T @ by_r[:, 0] - prior @ (place - [0.0, 0.0, down])
+        step = np.linalg.solve(N + near, gradient)
         length = float(np.linalg.norm(step))
         if k == STEPS or length < 1e-2:
             break

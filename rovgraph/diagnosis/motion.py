@@ -228,7 +228,10 @@ def separation_of(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statis
         "depth": (joint["depth"], np.abs(d[:, 2]), "m"),
         "heading": (joint["heading"], np.rad2deg(np.abs(turned)), "deg"),
     }
-    by_filter = _squares(f.take(at), s.take(at), f.take(at).cov_p, f.cov_theta[at, 2, 2])
+    # iSAM2's filtered sds lack what is considered, which the smoothed ones have
+    cov_p, yaw = f.cov_p[at], np.maximum(f.cov_theta[at, 2, 2], s.cov_theta[at, 2, 2])
+    lacking = np.maximum(np.diagonal(s.cov_p[at] - cov_p, axis1=1, axis2=2), 0.0)
+    by_filter = _squares(f.take(at), s.take(at), cov_p + lacking[:, None] * np.eye(3), yaw)
     for what, (square, size, unit) in sizes.items():
         k, mean = int(np.argmax(square)), float(np.mean(by_filter[what]))
         yield Statistic(

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.relief import SLOPE, Relief
-from rovgraph.model.config_sections import ChartSettings
+from rovgraph.model.config_sections import FOOT_M, ChartSettings
 from rovgraph.model.origin import Origin, lat_lon
 
 MOST_CELLS = 100_000_000  # of a file
 MOST_AROUND = 4_000_000  # about a track; where there are more, they are taken wider
-FOOT = 0.3048  # [m]
 SLOWLY_M = 15.0  # sd of the filter whose outcome varies slowly
 FAR = 0.95  # share of cells without holes, about one by the relief's length, of a depth that is used
 SEEN = 0.1  # share of a piece's soundings that a chart must have
@@ -124,7 +123,7 @@ class DepthChart:
         if not known.any():
             return "it has no depths where the track is"
         sounded, charted = float(np.median(depth[known])), float(np.median(own[known]))
-        if abs(charted * FOOT - sounded) < min(0.1 * sounded, abs(charted - sounded)):
+        if abs(charted * FOOT_M - sounded) < min(0.1 * sounded, abs(charted - sounded)):
             return f"it has {charted:.0f} where soundings have {sounded:.1f} m: its depths look like feet"
         if abs(charted - sounded) > OFF_M:
             return f"it has {charted:.0f} m where soundings have {sounded:.0f} m: another place or datum"

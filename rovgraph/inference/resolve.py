@@ -22,7 +22,7 @@ from rovgraph.log.reading import length_of_way, water_at
 from rovgraph.model.calibration import ACOUSTICS, AUTO, CONSIDERED, TABLE
 from rovgraph.model.config import GOOD_GYRO_DPS, Config, beliefs, with_priors_stated
 from rovgraph.model.config_sections import HIGHEST_LATITUDE_DEG
-from rovgraph.model.grids import convergence_and_scale
+from rovgraph.model.grids import convergence_and_scale, warn_outside
 from rovgraph.model.origin import Frame, frame_of
 from rovgraph.problem.acoustics import unusable_acoustics
 from rovgraph.problem.beams import beam_sensors
@@ -328,7 +328,9 @@ def _grid_of_results(dive: Resolution) -> None:
     """
     grid = dive.config.environment.grid
     if grid is not None and dive.log.origin is not None:
-        north, scale = (float(x) for x in convergence_and_scale(grid, *np.array(dive.log.origin)))
+        lat, lon = dive.log.origin
+        warn_outside(lon, lat, grid)
+        north, scale = (float(x) for x in convergence_and_scale(grid, *np.array([lat, lon])))
         turned_by = f"its north is {north:+.3f} deg from true north at the origin"
         dive.assume(f"results are in {grid}, too: {turned_by}, where a metre is {scale:.5f} m of the grid")
 

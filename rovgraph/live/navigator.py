@@ -31,7 +31,7 @@ from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
 from rovgraph.live.solution import BeaconPlace, CurrentAt, Event, RangeCircle, SensorHealth, ShipPose, Solution
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
-from rovgraph.model.config import Config, with_calibration
+from rovgraph.model.config import Config
 from rovgraph.model.origin import Origin, flat_error, outgrows_plane
 from rovgraph.problem.assembly import InsertResult
 from rovgraph.problem.initial_conditions import InitialConditions, restored
@@ -402,9 +402,9 @@ class Navigator:
         if "usbl" not in late or not self._exchanges:
             return None
         lag, sd = late["usbl"]
-        stated = {"estimate": True, "mean": lag, "sd": sd_of_lag(sd)}
-        initial = replace(engine.initial, config=with_calibration(engine.initial.config, "usbl_time_offset", stated))
-        self._crosscheck.config = with_calibration(self._crosscheck.config, "usbl_time_offset", stated)
+        stated = {"usbl_time_offset": {"estimate": True, "mean": lag, "sd": sd_of_lag(sd)}}
+        initial = replace(engine.initial, config=engine.initial.config.with_values(calibration=stated))
+        self._crosscheck.config = self._crosscheck.config.with_values(calibration=stated)
 
         def revised(known: Gaussian, layout: ErrorLayout) -> Gaussian:
             c = known.c.copy()

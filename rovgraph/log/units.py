@@ -18,12 +18,12 @@ from rovgraph.dates import EPOCHS, unix_of_epoch
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.streams import LAT_LON, OF_GRID, SHIP_LAT_LON, all_columns
+from rovgraph.model.config_sections import FOOT_M
 from rovgraph.sensors import SENSORS
 
 _DEG = float(np.deg2rad(1.0))
 _G = 9.80665  # standard gravity [m/s2]
-_FOOT = 0.3048  # [m]
-_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": _FOOT}
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": FOOT_M}
 _ANGLE = {"rad": 1.0, "deg": _DEG}
 
 # kind of quantity -> unit -> factor to the unit used inside
@@ -33,7 +33,7 @@ UNITS: dict[str, dict[str, float]] = {
     "rate": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG},
     "field": {"uT": 1.0, "nT": 1e-3, "mG": 0.1, "gauss": 100.0},
     "angle": _ANGLE,
-    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "ft/s": _FOOT},
+    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "ft/s": FOOT_M},
     "length": _LENGTH,
     "area": {f"{unit}2": factor**2 for unit, factor in _LENGTH.items()},
     "pressure": {

@@ -515,13 +515,6 @@ def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: C
     return config.with_values(calibration=entries)
 
 
-def with_calibration(config: Config, name: str, stated: Mapping[str, object]) -> Config:
-    """The configuration with other keys of a calibration variable."""
-    given = config.calibration
-    entry = getattr(given, name).model_copy(update=dict(stated))
-    return config.model_copy(update={"calibration": given.model_copy(update={name: entry})})
-
-
 def load_config(path: Path | str | None = None) -> Config:
     """Read a YAML configuration; without a path, all defaults.
 
@@ -575,7 +568,7 @@ def merged(stated: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 def _parse_config(data: dict[str, Any], source: str) -> Config:
     compatibility.refuse_newer(data.get("version"), compatibility.CONFIGURATION, f"{source}: configuration")
-    config = parse_model(Config, data, source)
+    config = parse_model(Config, compatibility.with_keys_of_today(data), source)
     warn_of_mixed_grades(config.imu, source)
     return config
 

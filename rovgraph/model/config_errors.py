@@ -44,6 +44,7 @@ def complaint(error: Any, model: type[BaseModel]) -> str:
         location = location[: -1 if kind == "invalid_key" else -2]
         allowed = f"one of {error['ctx']['expected']}" if kind == "literal_error" else "text"
         return f"{_key(location)}expected {allowed} as a key, found {_shown(error['input'])}"
+    location = _without_choices(location, model)
     location, found = _found(error, location)
     if kind in BOUNDS:
         name, text = BOUNDS[kind]
@@ -96,15 +97,30 @@ def _kind(model: Any, location: tuple[int | str, ...]) -> Any:
     return _bare(model)
 
 
+def _without_choices(location: tuple[int | str, ...], model: Any) -> tuple[int | str, ...]:
+    """A location without the name of the kind, behind a key whose value may be of several."""
+    before = next((k for k in range(len(location)) if _is_choice(_kind(model, location[:k]))), len(location))
+    return location[:before]
+
+
+def _is_choice(kind: Any) -> bool:
+    return get_origin(kind) in (Union, types.UnionType)
+
+
 def _bare(kind: Any) -> Any:
-    """A type without its bounds, and without the null that may stand instead."""
-    while get_origin(kind) in (Annotated, Union, types.UnionType):
-        kind = next(k for k in get_args(kind) if k is not type(None))
+    """A type without its bounds, and without the null that may stand instead; of several kinds their union."""
+    while get_origin(kind) is Annotated or _is_choice(kind):
+        kinds = [k for k in get_args(kind) if k is not type(None)]
+        if _is_choice(kind) and len(kinds) > 1:
+            return Union[tuple(map(_bare, kinds))]  # noqa: UP007
+        kind = kinds[0]
     return kind
 
 
 def _expected(kind: Any) -> str:
     """A value of a type in words."""
+    if _is_choice(kind):
+        return " or ".join(map(_expected, get_args(kind)))
     if get_origin(kind) is tuple:
         items = get_args(kind)
         return (

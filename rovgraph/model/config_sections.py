@@ -255,12 +255,17 @@ class MotionSettings(ConfigSection):
     )
 
 
+FOOT_M = 0.3048
+SLOWEST_MPS, FASTEST_MPS = 1300.0, 1700.0  # of sound in water
+
+
 def _in_water(mps: float) -> float:
     """Refuses what is no speed of sound in water in m/s."""
-    low, high = 1300.0, 1700.0
-    if not low <= mps <= high:
-        feet = f"; if it is in ft/s, state {mps * 0.3048:.0f}" if low <= mps * 0.3048 <= high else ""
-        raise PydanticCustomError("in_water", f"expected a speed of sound from {low:g} to {high:g} m/s{feet}")
+    if not SLOWEST_MPS <= mps <= FASTEST_MPS:
+        feet = SLOWEST_MPS <= mps * FOOT_M <= FASTEST_MPS
+        remedy = f"; if it is in ft/s, state {mps * FOOT_M:.0f}" if feet else ""
+        text = f"expected a speed of sound from {SLOWEST_MPS:g} to {FASTEST_MPS:g} m/s{remedy}"
+        raise PydanticCustomError("in_water", text)
     return mps
 
 

@@ -34,7 +34,8 @@ def _grid(name: str) -> Any:
     """The system of ``environment.grid``."""
     system = _system(name, KEY)
     if not system.is_projected:
-        raise InputError(f"{KEY} {name!r}: is in degrees, no grid; give one such as EPSG:32632, UTM zone 32")
+        what = "is in degrees, no grid" if system.is_geographic else f"{system.name} is no grid"
+        raise InputError(f"{KEY} {name!r}: {what}; give one such as EPSG:32632, UTM zone 32")
     return system
 
 
@@ -85,12 +86,22 @@ def projected(lon: Array, lat: Array, crs: str, key: str = "crs") -> tuple[Array
     system = _system(crs, key)
     if not (system.is_projected or system.is_geographic):
         raise InputError(f"{key} {crs!r}: {system.name} is no map's coordinates; give one such as EPSG:25832, or utm")
-    if system.area_of_use is not None and not _within(float(lon[0]), float(lat[0]), *system.area_of_use.bounds):
-        warn(f"{key} {crs!r}: {system.name} is not made for {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
     x, y = _transformer(ELLIPSOID, crs).transform(lon, lat)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise InputError(f"{key} {crs!r}: does not reach to {lat[0]:.3f}, {lon[0]:.3f}; choose one for that place")
     return np.asarray(x), np.asarray(y)
+
+
+def warn_outside(lon: float, lat: float, crs: str, key: str = KEY) -> None:
+    """Warn of a coordinate system, stated as ``key``, that is not made for a place [deg].
+
+    Raises
+    ------
+    InputError : coordinates that are not known
+    """
+    system = _system(crs, key)
+    if system.area_of_use is not None and not _within(lon, lat, *system.area_of_use.bounds):
+        warn(f"{key} {crs!r}: {system.name} is not made for {lat:.3f}, {lon:.3f}; choose one for that place")
 
 
 def _within(lon: float, lat: float, west: float, south: float, east: float, north: float) -> bool:

@@ -43,9 +43,9 @@ from datetime import UTC, date, datetime
 from typing import Literal
 
 from rovgraph.log.stamps import DAY_S
+from rovgraph.model.config_sections import FASTEST_MPS, SLOWEST_MPS
 from rovgraph.readers.nmea_sentences import has_checksum, number
 from rovgraph.readers.records import Refused, shown
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 HALF_HOUR_S = 1800.0
 FARTHEST_M = 20e3  # of a reply: farther, eastings and northings were taken for a relative position

@@ -46,12 +46,6 @@ EVOLOGICS = (
     "[180, 0, 0] if its z is down"
 )
 ENTITY_INFO, LBL_CONFIG, LBL_BEACON = 3, 203, 202
-USBL_FIX = "UsblFixExtended"
-TWICE = "of the same replies as what is used; choose usbl=NAME or fix=NAME"
-EVOLOGICS = (
-    "taken as x forward, y port, z up of the head, as an EvoLogics modem has them; state usbl.mount_rpy_deg: "
-    "[180, 0, 0] if its z is down"
-)
 
 
 def _layout(fields: str) -> np.dtype[np.void]:
@@ -86,7 +80,7 @@ NAMED = {  # messages that begin with the name of a target
         "UsblPositionExtended",
         _layout("x:f4 y:f4 z:f4 n:f4 e:f4 d:f4 phi:f4 theta:f4 psi:f4 accuracy:f4"),
     ),
-    900: ("UsblFixExtended", _layout("lat:f8 lon:f8 z_units:u1 z:f4 accuracy:f4")),
+    900: (USBL_FIX, _layout("lat:f8 lon:f8 z_units:u1 z:f4 accuracy:f4")),
 }
 ACOUSTIC = {kind for kind, _ in NAMED.values()}
 WANTED = {*PLAIN, *NAMED, ENTITY_INFO, LBL_CONFIG}

@@ -18,7 +18,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.disk_columns import every, spilled
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
+from rovgraph.model.config_sections import FASTEST_MPS, SLOWEST_MPS
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.log.disk_columns import FlatTable, computed, every, taken
+from rovgraph.model.config_sections import FASTEST_MPS, SLOWEST_MPS
 from rovgraph.readers import rosbag_messages as nucleus
 from rovgraph.readers.ardupilot import ONE_POINT, new_fixes, one_point
 from rovgraph.readers.formats import ReadingOptions
@@ -39,7 +40,6 @@ from rovgraph.readers.rosbag_messages import (
 )
 from rovgraph.readers.stamps import APART_S, by_arrivals
 from rovgraph.sensors.dvl_beam import BEAMS
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS
 
 FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
 BODIES = ("base_link", "base_link_frd", "base_footprint")

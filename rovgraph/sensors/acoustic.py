@@ -15,10 +15,11 @@ from rovgraph.kernels import measurements as kernels
 from rovgraph.kernels.measurement_row import WIDTH
 from rovgraph.model.calibration import USBL_MOUNT, beacon_names
 from rovgraph.model.config import Config
+from rovgraph.model.config_sections import FASTEST_MPS, SLOWEST_MPS
 from rovgraph.model.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument
-from rovgraph.sensors.sound import FASTEST_MPS, SLOWEST_MPS, is_in_feet, is_of_water, look_at_sound_speed
+from rovgraph.sensors.sound import is_in_feet, is_of_water, look_at_sound_speed
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
 MOST_ELEVATION = 0.5 * np.pi + 1e-6

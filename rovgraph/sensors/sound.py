@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.geometry import Array
+from rovgraph.model.config_sections import FASTEST_MPS, FOOT_M, SLOWEST_MPS
 
-SLOWEST_MPS, FASTEST_MPS = 1300.0, 1700.0
-FOOT_M = 0.3048
 BAR_OF_M = 0.10198  # of water [bar/m]
 LAYER_M = 1.0  # of water that is taken as one
 BEYOND_M = 1.0  # the end of a profile, that a vehicle may go

@@ -19,7 +19,7 @@ import pandas as pd
 
 from rovgraph.errors import InputError, in_one_line
 from rovgraph.geometry import Array
-from rovgraph.model.grids import ELLIPSOID, convergence_and_scale, is_projected, projected, utm_zone
+from rovgraph.model.grids import ELLIPSOID, convergence_and_scale, is_projected, projected, utm_zone, warn_outside
 from rovgraph.report.export.formats import ExportFormat, ExportOptions
 from rovgraph.report.export.track import SHOWN_HZ, Track, ellipse, point_table
 
@@ -263,6 +263,7 @@ def coordinates(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, 
     if crs is None:
         return lon, lat, ELLIPSOID
     name = utm_zone(float(lat[0]), float(lon[0])) if crs.lower() == "utm" else crs
+    warn_outside(float(lon[0]), float(lat[0]), name, "crs")
     return *projected(lon, lat, name), name
 
 
