@@ -311,7 +311,7 @@ class Full:
         self._write, self._csv, self._navigator, self._span = os.write, Trajectory.write_csv, navigator, (begin, end)
         self.refused = 0
         monkeypatch.setattr("rovgraph.live.files.os.write", self.write)
-        monkeypatch.setattr(Trajectory, "write_csv", lambda t, path, more=False, _=None: self.csv(t, path, more))
+        monkeypatch.setattr(Trajectory, "write_csv", lambda t, path, more=False, *_: self.csv(t, path, more))
 
     def _check(self) -> None:
         if self._span[0] < self._navigator.time < self._span[1]:
