@@ -15,6 +15,7 @@ from rovgraph.cli.app import main
 from rovgraph.geometry import matrix_from_rpy, rotate
 from rovgraph.inference.bottom import RANGE_SD, SLOPE_SD, Bottom, bottom_under
 from rovgraph.inference.trajectory import Trajectory, read_trajectory
+from rovgraph.kernels.earth import radii
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs.json_lines import as_dict
 from rovgraph.log import STREAMS, Stream
@@ -86,6 +87,17 @@ def test_four_ranges_give_altitude_depth_and_slope_of_the_bottom(track, config, 
     soundings = bottom.soundings
     np.testing.assert_allclose(soundings["depth"], DEPTH + soundings[["north", "east"]] @ SLOPE, atol=1e-9)
     assert len(soundings) == 4 * len(track) and set(soundings["beam"]) == {0, 1, 2, 3}
+
+
+def test_soundings_far_from_the_origin_are_metres_from_the_vehicle(track, config, ranges):
+    latitude, away = 70.0, np.array([1e5, 0.0, 0.0])
+    on_earth = config.with_values(environment={"frame": "earth", "origin_lat_deg": latitude, "origin_lon_deg": 5.0})
+    near, far = found(track, config, ranges), found(replace(track, p_n=track.p_n + away), on_earth, ranges)
+    metres = [(b.soundings[["north", "east"]].to_numpy() - np.repeat(b.place[:, :2], 4, axis=0)) for b in (near, far)]
+    M, N = radii(np.deg2rad(np.array([latitude, latitude + np.rad2deg(1e5 / radii(np.deg2rad(latitude))[0])])))
+    east = N[0] * np.cos(np.deg2rad(latitude)) / (N[1] * np.cos(np.deg2rad(latitude) + 1e5 / M[0]))
+    assert east > 1.04
+    np.testing.assert_allclose(metres[1], metres[0] * [M[0] / M[1], east], rtol=1e-5)
 
 
 @pytest.mark.parametrize("share", [0.003, 0.03])

@@ -11,7 +11,7 @@ import pytest
 
 import rovgraph
 from rovgraph import InputError
-from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
+from rovgraph.geometry import EARTH_RATE, Array, exp_rotation, matrix_from_rpy
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.earth import normal_gravity, radii
 from rovgraph.kernels.motion import transitions
@@ -23,10 +23,11 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.model.calibration import TABLE
 from rovgraph.model.config import Config
 from rovgraph.model.origin import EarthOrigin, frame_of, lat_lon, north_east
-from rovgraph.model.state import State
+from rovgraph.model.state import POSE, State
 from rovgraph.problem.motion import preintegrate, preintegration_params
 from rovgraph.report.export.track import read_track
 from rovgraph.sensors.instruments import instruments
+from rovgraph.sensors.position import PlaceOffset, Position
 from rovgraph.simulate.dive import specific_force_and_rate
 from rovgraph.simulate.path import Path as SimulatedPath
 
@@ -262,6 +263,50 @@ def test_a_range_is_that_between_two_places_on_earth(latitude):
     state = State(R_NB[None], p, np.zeros((1, 3)), np.zeros((1, 6)), calibration)
     found = model.of(x).predict(state, np.zeros((1, 3)))[0][0, 0]
     assert found == pytest.approx(np.linalg.norm(np.subtract(*ends)), abs=0.003)
+
+
+def seen_from(truth: Array, arm_n: Array) -> tuple[float, float]:
+    """Latitude and longitude [deg] of a point that lies an arm [m] from a place."""
+    from pymap3d import ned2geodetic
+
+    lat, lon, _ = ned2geodetic(*(float(x) for x in arm_n), *(float(x) for x in truth[:2]), 0.0)
+    return lat, lon
+
+
+@pytest.mark.parametrize("latitude", [45.0, 70.0, -60.0])
+def test_a_point_on_the_vehicle_is_where_geodesy_has_it_and_moves_by_its_derivative(latitude):
+    origin, p, arm = EarthOrigin(latitude, 10.0), np.array([[9e4, -3e4, 0.0]]), np.array([40.0, -25.0, 3.0])
+    known = float(np.deg2rad(latitude))
+    fix = Position("fix", arm, (0, 1), error="fix_error", latitude=known)
+    calibration = {"fix_error": np.zeros(2), "place": np.zeros(2)}
+
+    def seen(model: Any, d: Array) -> tuple[Array, Array]:
+        R_nb, p_n = (R_NB @ exp_rotation(d[:3]))[None], p + R_NB @ d[3:]
+        z, H = model.predict(State(R_nb, p_n, np.zeros((1, 3)), np.zeros((1, 6)), calibration), np.zeros((1, 3)))
+        return z[0], H[POSE][0]
+
+    here = np.array([float(x[0]) for x in lat_lon(p[:, 0], p[:, 1], origin)])
+    expected = np.array(north_east(*seen_from(here, R_NB @ arm), origin))
+    for model in (fix, PlaceOffset(arm, known)):
+        found, H = seen(model, np.zeros(6))
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+        steps = 1e-2 * np.eye(6)
+        change = [(seen(model, step)[0] - seen(model, -step)[0]) / 2e-2 for step in steps]
+        np.testing.assert_allclose(H, np.transpose(change), atol=1e-3)
+
+
+def test_a_track_a_degree_from_its_origin_is_that_of_the_body_whatever_the_arms(tmp_path):
+    log, truth = transit(70.0, 10.0, 60.0)
+    antenna, at_imu = [3.0, -2.0, 0.0], [-4.0, 1.0, 0.2]
+    for k in (0, len(log) - 1):
+        log.loc[log.index[k], ["fix_lat", "fix_lon"]] = seen_from(truth[k], R_NB @ antenna)
+    log.to_csv(tmp_path / "log.csv", index=False, float_format="%.12g")
+    stated = config(origin_lat_deg=69.0, origin_lon_deg=10.0) | {"fix": {"lever_arm_m": antenna}}
+    stated["imu"]["lever_arm_m"] = stated["dvl"]["lever_arm_m"] = at_imu
+    settings = rovgraph.parse_config(json.dumps(stated))
+    result = rovgraph.smooth(rovgraph.read_log(tmp_path / "log.csv", settings), settings)
+    at = np.interp(result.smoothed.trajectory.time, log["time"], np.arange(len(log))).round().astype(int)
+    assert apart(result, truth[at]) < 0.01
 
 
 def test_a_fix_with_the_last_ping_counts(tmp_path):

@@ -1,6 +1,6 @@
 """The bottom under a track: soundings by the DVL's ranges, and by them its depth, its slope and the altitude over it.
 
-A range meets the bottom at ``p_n + a``, with the arm from the body's origin
+A range meets the bottom at ``p_n + s a``, s what a metre changes n by, with the arm from the body's origin
 
     a = R_nb (l_b + R_bs d rho)
 
@@ -28,6 +28,7 @@ from rovgraph.inference.trajectory import Trajectory
 from rovgraph.log import Log, Stream
 from rovgraph.model.calibration import BEAM_SENSORS, MOUNT
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.origin import scale_at
 from rovgraph.problem.beams import nearest
 from rovgraph.sensors.dvl import TIME_OFFSET
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
@@ -55,7 +56,7 @@ class Bottom:
     numbers : of the beams, -1 = the DVL's one altitude
     arm_n : ndarray, shape (n, k, 3), from the body's origin to the bottom, NaN where a ping has no such range [m]
     used : ndarray of bool, shape (n, k), False where there is none, and of spikes
-    place : ndarray, shape (n, 3), of the body's origin [m]
+    place, metre : ndarrays, shape (n, 3), of the body's origin, and what a metre changes n by there [m]
     cov_arm : ndarray, shape (n, k, 3, 3), of a sounding by itself, that of the body's origin included [m^2]
     plane : ndarray, shape (n, 3), altitude of the body's origin [m], slope towards north and east: how much deeper the
         bottom becomes in a metre
@@ -68,6 +69,7 @@ class Bottom:
     arm_n: Array
     used: NDArray[np.bool_]
     place: Array
+    metre: Array
     cov_arm: Array
     plane: Array
     cov_plane: Array
@@ -81,7 +83,7 @@ class Bottom:
         """A row for each range, by time and beam: time [s], north, east, depth, their sds [m], used (1, or 0 of a
         spike) and beam, -1 = the DVL's one altitude."""
         ping, k = np.nonzero(np.isfinite(self.arm_n[..., 2]))
-        position = self.place[ping] + self.arm_n[ping, k]
+        position = self.place[ping] + self.metre[ping] * self.arm_n[ping, k]
         sd = np.sqrt(np.diagonal(self.cov_arm[ping, k], axis1=1, axis2=2))
         names = ("north", "east", "depth")
         columns = {
@@ -144,6 +146,10 @@ class _Ranges:
         """Of the DVL, from the body's origin [m]."""
         moved = [self.value(f"dvl_lever_arm{axis}") for axis in ("_x", "_y", "_z")]
         return np.array(self._config.dvl.lever_arm_m) + moved
+
+    def metre(self, p_n: Array) -> Array:
+        """What a metre changes n by at some places, shape (n, 3)."""
+        return scale_at(self._config.environment.earth_latitude, p_n)
 
     @property
     def scale(self) -> float:
@@ -241,7 +247,7 @@ def _fitted(numbers: tuple[int, ...], time: Array, u_b: Array, rho: Array, here:
     S = skew(arm)
     cov_arm = here.cov_p[:, None] + S @ cov_theta[:, None] @ transpose(S)
     cov_arm = cov_arm + own[..., None, None] * u_n[..., :, None] * u_n[..., None, :]
-    return Bottom(time, numbers, arm, used, here.p_n, cov_arm, plane, cov_plane, noise)
+    return Bottom(time, numbers, arm, used, here.p_n, ranges.metre(here.p_n), cov_arm, plane, cov_plane, noise)
 
 
 def _planes(arm: Array, sd: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:

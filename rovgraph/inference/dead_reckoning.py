@@ -17,10 +17,11 @@ from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity
 from rovgraph.inference.initialise import by_accuracy, solve_turn, turn_noise
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.dead_reckoning import Aiding, LevelStart, Motions, Surroundings, reckon_attitude
-from rovgraph.kernels.earth import latitude_at, scales
+from rovgraph.kernels.earth import latitude_at
 from rovgraph.kernels.measurement_row import ASSUMED, DP, DR, DT, DV, RATE, RATE_SD, TIME
 from rovgraph.kernels.motion import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.model.config import Config, beliefs
+from rovgraph.model.origin import scale_at
 from rovgraph.model.state import State
 from rovgraph.problem.beams import SolvedPings, solved_pings
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -114,12 +115,9 @@ def dead_reckon(problem: Problem, initial: InitialConditions, calibration: Mappi
     k = epochs.keyframe
     began, latitude = initial.prior.state.p_n[0], initial.config.environment.earth_latitude
     p_n = began + np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
-    if not np.isnan(latitude):
-        for _ in range(2):  # the scales are those of where it is
-            middle = 0.5 * (p_n[1:] + p_n[:-1])
-            north, east = scales(latitude, latitude_at(latitude, middle[:, 0]), middle[:, 2])
-            scaled = step * np.column_stack([north, east, np.ones(len(step))])
-            p_n = began + np.vstack([np.zeros(3), np.cumsum(scaled, axis=0)])
+    for _ in range(2):  # the scales are those of where it is
+        metres = scale_at(latitude, 0.5 * (p_n[1:] + p_n[:-1]))
+        p_n = began + np.vstack([np.zeros(3), np.cumsum(metres * step, axis=0)])
     p_n = p_n[k]
     p_n[:, 2] = _depths(problem, p_n[:, 2], R_nb[k], initial, calibration)
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))

@@ -19,6 +19,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.assembly import RATE_B, SPREAD, TIME
 from rovgraph.model.calibration import CONSIDERED, LAYERS, LAYOUT, TABLE, Belief, beacon_names
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.origin import scale_at
 from rovgraph.model.state import State
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.measurements import Measurements
@@ -294,7 +295,8 @@ def body_trajectory(
     """
     R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(initial.config.imu.lever_arm_m)
     time, rate_b = keyframes[:, TIME].copy(), keyframes[:, RATE_B : RATE_B + 3]
-    p_n = states.p_n - rotate(R, lever_arm_b)
+    metres = scale_at(initial.config.environment.earth_latitude, states.p_n)
+    p_n = states.p_n - metres * rotate(R, lever_arm_b)
     v_n = states.v_n - rotate(R, cross(rate_b - states.bias[:, 3:], lever_arm_b))
     if cov_pose is None or cov_velocity is None:
         return Trajectory.certain(time, p_n, R, v_n)

@@ -35,6 +35,7 @@ from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import CLEAR_SPEED
 from rovgraph.model.calibration import Belief
 from rovgraph.model.config import Config, beliefs, mount_matrix
+from rovgraph.model.origin import scale_at
 from rovgraph.model.state import POSE, Jacobians, State
 from rovgraph.problem.acoustics import sightings, unusable_acoustics
 from rovgraph.problem.initial_conditions import InitialConditions, StatePrior
@@ -370,8 +371,9 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
         "heading_sd_deg": float(np.rad2deg(rpy_sd[2])),
     }
     config = config.with_values(start=filled)
-    at_imu = p_n + R_nb @ np.asarray(config.imu.lever_arm_m)
-    state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
+    arm_n = R_nb @ np.asarray(config.imu.lever_arm_m)
+    at_imu = p_n[None] + scale_at(config.environment.earth_latitude, p_n[None]) * arm_n
+    state = State(R_nb[None], at_imu, np.zeros((1, 3)), bias[None])
     prior = StatePrior(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
     return InitialConditions(config, {s: every[s] for s in used}, prior, dive.assumptions)
 

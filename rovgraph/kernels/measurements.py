@@ -19,8 +19,9 @@ DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17
 COMPASS         the same, with an x axis that is known
 MAGNETOMETER    z = |H| ((1 + s) S R_sb R_bn u(declination - A - ...,      (3.11), (3.14),
                 dip + d) + iron)                                           S: (3.2)
-POSITION        some of (1 + k) (p + R_nb l) + offset + e, north, east, down
-PLACE_OFFSET    z = (p + R_nb l)_north,east - m, m where the place is
+POSITION        some of (1 + k) (p + s R_nb l) + offset + e, north, east,   s: `earth.scales`
+                down
+PLACE_OFFSET    z = (p + s R_nb l)_north,east - m, m where the place is
 WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
 TILT            z = roll and pitch of R_nb
 ACOUSTIC        z = (1 + k) r + offset + clock + e; and 0, 0, less how     ranges both ways, below
@@ -401,22 +402,39 @@ def dvl_beam(state: Epoch, rate: Array, x: Array, z_out: Array, H_out: Array, wo
     z_out[0] += along
 
 
+Scale = tuple[float, float, float]
+
+
 @view_helper
-def _point(R: Array, p: Array, lever_arm_b: Array, axis: int, H_out: Array) -> float:
-    """One component in n of a point on the vehicle; ``H_out`` is its row."""
+def _metres(origin: float, north: float, down: float) -> Scale:
+    """What a metre changes north, east and down by at a place; ``origin``, its latitude, NaN of a flat frame.
+
+    Derivatives take it as constant: by a metre it changes by less than 1e-6 below a latitude of 80 deg.
+    """
+    if math.isnan(origin):
+        return 1.0, 1.0, 1.0
+    of_north, of_east = scales(origin, latitude_at(origin, north), down)
+    return of_north, of_east, 1.0
+
+
+@view_helper
+def _point(R: Array, p: Array, lever_arm_b: Array, scale: float, axis: int, H_out: Array) -> float:
+    """One component in n of a point on the vehicle, which a metre changes by ``scale``; ``H_out`` is its row."""
     row = R[axis]
     cross(lever_arm_b, row, H_out[0:3])
     for k in range(3):
+        H_out[k] *= scale
         H_out[TRANSLATION + k] = row[k]
-    return p[axis] + dot(row, lever_arm_b)  # type: ignore[no-any-return]
+    return p[axis] + scale * dot(row, lever_arm_b)  # type: ignore[no-any-return]
 
 
 @view_helper
 def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
     """Some of north, east, down of a point on the vehicle, with errors of scale, constant and lasting."""
-    offset, scale, error = int(params[3]), int(params[4]), int(params[5])
+    offset, scale, error, metres = int(params[3]), int(params[4]), int(params[5]), _metres(params[6], p[0], p[2])
     for i in range(len(z_out)):
-        z_out[i] = _point(R, p, params[0:3], int(params[6 + i]), H_out[i])
+        axis = int(params[7 + i])
+        z_out[i] = _point(R, p, params[0:3], metres[axis], axis, H_out[i])
         if scale >= 0:
             larger = 1.0 + c[scale]
             for k in range(TRANSLATION + 3):
@@ -434,9 +452,9 @@ def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: A
 @view_helper
 def place_offset(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
     """North and east from a place to a point on the vehicle."""
-    place = len(c) - 2
+    place, metres = len(c) - 2, _metres(params[3], p[0], p[2])
     for i in range(2):
-        z_out[i] = _point(R, p, params[0:3], i, H_out[i]) - c[place + i]
+        z_out[i] = _point(R, p, params[0:3], metres[i], i, H_out[i]) - c[place + i]
         H_out[i, MOTION + place + i] = -1.0
 
 
@@ -460,21 +478,6 @@ def _angle_factor(cosine: float) -> tuple[float, float]:
     square = max(1.0 - cosine * cosine, 1e-12)
     factor = math.acos(max(cosine, -1.0)) / math.sqrt(square)
     return factor, (cosine * factor - 1.0) / square
-
-
-Scale = tuple[float, float, float]
-
-
-@view_helper
-def _metres(origin: float, p: Array, apart: Array) -> Scale:
-    """What a metre changes north, east and down by, halfway to a place that is ``apart``; ``origin``, its latitude.
-
-    Derivatives take it as constant: by a metre it changes by less than 1e-6 below a latitude of 80 deg.
-    """
-    if math.isnan(origin):
-        return 1.0, 1.0, 1.0
-    north, east = scales(origin, latitude_at(origin, p[0] - 0.5 * apart[0]), p[2] - 0.5 * apart[2])
-    return north, east, 1.0
 
 
 @view_helper
@@ -546,7 +549,7 @@ def acoustic(state: Epoch, x: Array, z_out: Array, H_out: Array, work: Array) ->
             other = c[int(x[DOWN_AT])]
         ends[0, i] = state.p[i] - other - x[ASKED + i]
         ends[1, i] = state.p[i] - other - x[HEARD + i]
-    scale = _metres(x[ORIGIN], state.p, ends[1])
+    scale = _metres(x[ORIGIN], state.p[0] - 0.5 * ends[1, 0], state.p[2] - 0.5 * ends[1, 2])  # halfway
     for i in range(3):
         place = there[i] + offset * x[MOVES + i] - (0.0 if inverted else work[5, 1, i])
         ends[0, i] = ends[0, i] / scale[i] + place + x[WAIT] * state.v[i]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.earth import radii
+from rovgraph.kernels.earth import latitude_at, radii, scales
 
 
 class EarthOrigin(NamedTuple):
@@ -41,6 +41,24 @@ def origin_in(frame: str, lat: float, lon: float) -> Origin:
 def frame_of(origin: Origin) -> Frame:
     """The frame whose origin it is."""
     return "earth" if isinstance(origin, EarthOrigin) else "flat"
+
+
+def scale_at(latitude: float, p_n: Array) -> Array:
+    """What a metre changes north, east and down by at some places.
+
+    Parameters
+    ----------
+    latitude : of the origin of frame "earth" [rad]; NaN = n is flat
+    p_n : ndarray, shape (k, 3) [m]
+
+    Returns
+    -------
+    ndarray, shape (k, 3)
+    """
+    out = np.ones_like(p_n)
+    if not np.isnan(latitude):
+        out[:, :2] = np.column_stack(scales(latitude, latitude_at(latitude, p_n[:, 0]), p_n[:, 2]))
+    return out
 
 
 def flat_error(latitude: float, metres: float) -> float:

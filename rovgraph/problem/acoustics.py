@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy, rotate, rpy_axes, transpose, wrap_angle
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.earth import latitude_at, scales
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.streams import label_number
 from rovgraph.model.calibration import LAYOUT, USBL_MOUNT, beacon_names
 from rovgraph.model.config import Config, mount_matrix
+from rovgraph.model.origin import scale_at
 from rovgraph.sensors.acoustic import AcousticExchange
 from rovgraph.sensors.instruments import Instrument
 from rovgraph.sensors.sensor import LARGEST_SD
@@ -434,7 +434,8 @@ class Acoustics:
             place = np.column_stack([pose.p, np.zeros(n)])
             antenna = rotate(R_ns, np.broadcast_to(np.array(self.config.ship.antenna_m), (n, 3)))
             antenna[:, 2] = 0.0  # heights count from the waterline
-            context[:, part : part + 3] = place + scale_at(self.config, place) * (rotate(R_ns, arms) - antenna)
+            metres = scale_at(self.config.environment.earth_latitude, place)
+            context[:, part : part + 3] = place + metres * (rotate(R_ns, arms) - antenna)
             why.append(("without a position of the ship", on_ship & np.isnan(pose.p).any(axis=1)))
             if heading:
                 why.append(("without a heading of the ship", on_ship & np.isnan(pose.rpy[:, 2])))
@@ -605,14 +606,6 @@ class Acoustics:
             signal.values = np.array(state[f"{sensor}_values"], float).reshape(-1, signal.width)
 
 
-def scale_at(config: Config, p_n: Array) -> Array:
-    """What a metre changes north, east and down by at some places, shape (k, 3)."""
-    out, latitude = np.ones_like(p_n), config.environment.earth_latitude
-    if not math.isnan(latitude):
-        out[:, :2] = np.column_stack(scales(latitude, latitude_at(latitude, p_n[:, 0]), p_n[:, 2]))
-    return out
-
-
 class Sightings(NamedTuple):
     """Where acoustic directions and ranges put the vehicle by themselves, by the head's nominal mounting.
 
@@ -642,7 +635,7 @@ def sightings(log: Log, config: Config, instruments: Mapping[str, Instrument], l
     R = x[:, at.FRAME : at.FRAME + 9].reshape(-1, 3, 3) @ mount_matrix(config.usbl.mount_rpy_deg)
     head = x[:, at.HEARD : at.HEARD + 3]
     way = rotate(R, z[:, :1] * x[:, at.SEEN : at.SEEN + 3])
-    p = head + scale_at(config, head + 0.5 * way) * way
+    p = head + scale_at(config.environment.earth_latitude, head + 0.5 * way) * way
     across = z[:, 0] * np.max(
         np.where(sd[:, 1:] < LARGEST_SD, sd[:, 1:], 0.0), axis=1
     )  # a depth that is given is known

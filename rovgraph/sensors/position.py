@@ -34,6 +34,7 @@ class Position:
     axes : indices of the components measured, (2,) for depth, (0, 1) for a fix
     offset, scale, error : names of the calibration variable that is added, of the scale's error, and of the error that
         lasts, or None
+    latitude : of the origin of frame "earth" [rad]; NaN = n is flat
     """
 
     sensor: str
@@ -42,6 +43,7 @@ class Position:
     offset: str | None = None
     scale: str | None = None
     error: str | None = None
+    latitude: float = np.nan
     angular = False
     state = (POSE, VELOCITY, BIAS)
     kind = kernels.POSITION
@@ -56,10 +58,10 @@ class Position:
 
     @cached_property
     def packed(self) -> Array:
-        """The lever arm, places of offset, scale and error in the calibration vector or -1, the components measured."""
+        """Lever arm, places of offset, scale and error in the calibration vector or -1, latitude, components."""
         names = self.offset, self.scale, self.error
         places = [-1 if name is None else LAYOUT[name].start for name in names]
-        return np.array([[*self.lever_arm_b, *places, *self.axes]], dtype=float)
+        return np.array([[*self.lever_arm_b, *places, self.latitude, *self.axes]], dtype=float)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)
@@ -82,7 +84,8 @@ def _with_waves(values: Array, believed: Instrument, config: Config) -> Array:
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
-    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1), error="fix_error")
+    latitude = config.environment.earth_latitude
+    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1), error="fix_error", latitude=latitude)
     return instrument(fix, model, fix.sd_m, ("north", "east"), time_offset="fix_time_offset")
 
 
@@ -183,9 +186,11 @@ class PlaceOffset:
     Attributes
     ----------
     lever_arm_b : ndarray, shape (3,), of the camera relative to the state's origin [m]
+    latitude : of the origin of frame "earth" [rad]; NaN = n is flat
     """
 
     lever_arm_b: Array
+    latitude: float
     sensor = "place"
     dim = PLACE_DIM
     angular = False
@@ -195,8 +200,8 @@ class PlaceOffset:
 
     @cached_property
     def packed(self) -> Array:
-        """The lever arm."""
-        return np.array([self.lever_arm_b], dtype=float)
+        """The lever arm, and the latitude."""
+        return np.array([[*self.lever_arm_b, self.latitude]], dtype=float)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE, PLACE), state, rate_b)
@@ -205,7 +210,8 @@ class PlaceOffset:
 def recognition(config: Config, origin_b: Array) -> Instrument:
     """A place that is not believed is another place, which nothing has to be readmitted to."""
     place = config.place
-    return instrument(place, PlaceOffset(np.array(place.lever_arm_m) - origin_b), place.sd_m, ("north", "east"))
+    model = PlaceOffset(np.array(place.lever_arm_m) - origin_b, config.environment.earth_latitude)
+    return instrument(place, model, place.sd_m, ("north", "east"))
 
 
 SEEN_PLACE = Sensor(
