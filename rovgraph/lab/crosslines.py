@@ -7,7 +7,8 @@ its shift, and is taken as matched if its shift is predicted within the range of
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,13 +34,14 @@ from rovgraph.inference.estimate import Estimate
 from rovgraph.inference.initialise import initialise
 from rovgraph.inference.relief import CELL_M, Line, Relief, fit_relief, lines_of
 from rovgraph.inference.smoother import assemble
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.lab.plan import DVL_HZ, IMU_HZ
 from rovgraph.log import Log
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import AS_WRITTEN, Config
 from rovgraph.process import Progress, no_progress
-from rovgraph.sensors.instruments import HEADING_STREAMS
 from rovgraph.sensors import SENSORS
+from rovgraph.sensors.instruments import HEADING_STREAMS
 from rovgraph.simulate import CALM, Path, Style, Truth, simulate
 from rovgraph.simulate.path import Route, path_along, timetable
 
@@ -83,8 +85,7 @@ class CrosslinePlan:
     corner : ndarray, shape (2,), where they begin, north and east [m]
     speed : [m/s]
     relief : of the bottom
-    recorded_sd : of the dive as it was, horizontal, rms over its lines [m]
-    ranked : without crosslines, then with the best one, two and four; without any where the bottom shows no relief
+    ranked : the dive as recorded, then with the best one, two and four; these only where the bottom shows relief
     """
 
     lines: int
@@ -93,7 +94,6 @@ class CrosslinePlan:
     corner: Array
     speed: float
     relief: Relief
-    recorded_sd: float
     ranked: Sequence[Crossed]
 
 
@@ -120,18 +120,16 @@ def plan_crosslines(
         raise InputError(f"{log.source}: crosslines are planned for dives without {' and '.join(shown) or 'places'}")
     lines, relief_there = _lines_and_relief(log, config, first, relief)
     grid = _Grid.of(log.source, lines)
-    about = len(lines), float(grid.lengths.sum()), grid.course, grid.corner, grid.speed, relief_there
-    recorded = drift_of(first)
-    before = _sd(recorded, _on_lines(recorded, lines))
-    if not relief_there.shows:
-        return CrosslinePlan(*about, before, ())
-    progress("simulating", 0.5)
-    sources = tuple(SENSORS[s].heading_source for s in HEADING_STREAMS if s in dive.initial.streams)
-    ping_hz = float(1.0 / np.median(np.diff(first.posterior.time)))
-    imu = log.streams.get("imu")
-    imu_hz = MOST_IMU_HZ if imu is None else float(1.0 / np.median(np.diff(imu.time)))
-    track = _simulated(grid, config.with_values(heading={"sources": sources}), imu_hz, ping_hz)
-    return CrosslinePlan(*about, before, _ranked(grid, track, relief_there))
+    recorded = _Driven(drift_of(first), lines, [None] * len(lines), first.trajectory, relief_there).crossed([])
+    ranked = [recorded]
+    if relief_there.shows:
+        sources = tuple(SENSORS[s].heading_source for s in HEADING_STREAMS if s in dive.initial.streams)
+        imu = log.streams.get("imu")
+        imu_hz = MOST_IMU_HZ if imu is None else float(1.0 / np.median(np.diff(imu.time)))
+        rates = imu_hz, float(1.0 / np.median(np.diff(first.posterior.time)))
+        ranked += _ranked(grid, config.with_values(heading={"sources": sources}), rates, relief_there, progress)
+    length = float(np.linalg.norm(grid.legs[:, 1] - grid.legs[:, 0], axis=1).sum())
+    return CrosslinePlan(len(lines), length, grid.course, grid.corner, grid.speed, relief_there, ranked)
 
 
 def _lines_and_relief(
@@ -153,7 +151,9 @@ def _lines_and_relief(
 def _swath(time: Array, heading: Array, position: Array, half_width: float) -> list[Line]:
     """Lines of a track whose soundings fill a swath."""
     t = np.arange(time[0], time[-1], 0.5)
-    p, psi = (np.stack([np.interp(t, time, axis) for axis in x.T], axis=-1) for x in (position, np.unwrap(heading)[:, None]))
+    p, psi = (
+        np.stack([np.interp(t, time, axis) for axis in x.T], axis=-1) for x in (position, np.unwrap(heading)[:, None])
+    )
     side = np.hstack([-np.sin(psi), np.cos(psi)])
     across = np.arange(-half_width, half_width + 1e-9, CELL_M) if half_width else np.zeros(1)
     place = (p[:, None] + across[:, None] * side[:, None]).reshape(-1, 2)
@@ -180,11 +180,6 @@ class _Grid:
     along: Array
     speed: float
     half_width: float
-
-    @property
-    def lengths(self) -> Array:
-        """Of the lines [m]."""
-        return np.asarray(np.linalg.norm(self.legs[:, 1] - self.legs[:, 0], axis=1))
 
     @staticmethod
     def of(source: str, lines: Sequence[Line]) -> "_Grid":
@@ -244,32 +239,76 @@ def _simulated(grid: _Grid, config: Config, imu_hz: float, ping_hz: float) -> Es
     return assemble(log, initialise(log, config)).solve()
 
 
-def _ranked(grid: _Grid, track: Estimate, relief: Relief) -> list[Crossed]:
-    """Without crosslines, and with the best ones, each added to those before."""
-    found, drift = track.trajectory, drift_of(track)
-    lines = _swath(found.time, found.rpy[:, 2], found.p_n[:, :2], grid.half_width)
-    which = [grid.crossline_at(float(line.time.mean())) for line in lines]
-    own = _on_lines(drift, [line for line, k in zip(lines, which, strict=True) if k is None])
-    place = np.stack([np.interp(drift.time[own], found.time, axis) for axis in found.p_n[:, :2].T], axis=-1)
-    crossings = [c for k in range(1, len(lines)) for c in crossings_of(lines, k, drift)]
-    information = [_worth(lines, c, relief) for c in crossings]
-
-    def crossed(some: Sequence[int]) -> Crossed:
-        driven = [all(which[j] in (None, *some) for j in (c.line, c.earlier)) for c in crossings]
-        closures = _matched(drift, [(c, J) for c, J, d in zip(crossings, information, driven, strict=True) if d])
-        left = drift.given(closures) if closures else drift
-        chosen = sorted(some, key=lambda k: float(grid.along[k]))
-        return Crossed(
-            grid.along[chosen], grid.crosslines[chosen], len(closures), _sd(left, own), _sd(left, own, place)
-        )
-
-    out, chosen = [crossed([])], list[int]()
-    for count in COUNTS:
+def _ranked(
+    grid: _Grid, config: Config, rates: tuple[float, float], relief: Relief, progress: Progress
+) -> list[Crossed]:
+    """With the best crosslines, each added to those before as all of them show it, and then driven by themselves."""
+    out, chosen = [], list[int]()
+    progress("simulating", 0.2)
+    together = _Driven.of(grid, _simulated(grid, config, *rates), relief)
+    for done, count in enumerate(COUNTS):
         while len(chosen) < count:
             left = [k for k in range(len(grid.along)) if k not in chosen]
-            chosen.append(min(left, key=lambda k: crossed([*chosen, k]).sd))
-        out.append(crossed(chosen))
+            chosen.append(min(left, key=lambda k: together.crossed([*chosen, k]).sd))
+        progress("simulating", 0.4 + 0.2 * done)
+        some = sorted(chosen)
+        if count < len(grid.along):
+            alone = replace(grid, crosslines=grid.crosslines[some], along=grid.along[some])
+            out.append(_Driven.of(alone, _simulated(alone, config, *rates), relief).crossed(range(count)))
+        else:
+            out.append(together.crossed(some))
     return out
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A survey that was driven, with or without crosslines.
+
+    Attributes
+    ----------
+    drift, lines : of its track
+    crosslines : number of the crossline that each line is, or None
+    track : of it
+    relief : of the bottom
+    grid : of the crosslines; None = without
+    """
+
+    drift: Drift
+    lines: Sequence[Line]
+    crosslines: Sequence[int | None]
+    track: Trajectory
+    relief: Relief
+    grid: _Grid | None = None
+
+    @staticmethod
+    def of(grid: _Grid, estimate: Estimate, relief: Relief) -> "_Driven":
+        track = estimate.trajectory
+        lines = _swath(track.time, track.rpy[:, 2], track.p_n[:, :2], grid.half_width)
+        which = [grid.crossline_at(float(line.time.mean())) for line in lines]
+        return _Driven(drift_of(estimate), lines, which, track, relief, grid)
+
+    @cached_property
+    def crossings(self) -> list[tuple[Crossing, Array]]:
+        """All of them, with the information that soundings have on the shift of each, shape (2, 2) [1/m^2]."""
+        found = [c for k in range(1, len(self.lines)) for c in crossings_of(self.lines, k, self.drift)]
+        return [(c, _worth(self.lines, c, self.relief)) for c in found]
+
+    def crossed(self, some: Sequence[int]) -> Crossed:
+        """With the crossings of some crosslines, and those of the survey by itself."""
+        driven = {None, *some}
+        both = [(c, J) for c, J in self.crossings if {self.crosslines[c.line], self.crosslines[c.earlier]} <= driven]
+        closures = _matched(self.drift, both) if self.relief.shows else []
+        left = self.drift.given(closures) if closures else self.drift
+        own = np.zeros(len(left.time), bool)
+        for line in (x for x, k in zip(self.lines, self.crosslines, strict=True) if k is None):
+            own |= (left.time >= line.time[0]) & (left.time <= line.time[-1])
+        place = np.stack([np.interp(left.time[own], self.track.time, x) for x in self.track.p_n[:, :2].T], axis=-1)
+        rows = np.repeat(own, 2)
+        P, grid, order = left.P[np.ix_(rows, rows)], self.grid, list(some)
+        if grid is None or not order:
+            return Crossed(np.empty(0), np.empty((0, 2, 2)), len(closures), *_sds(P, place))
+        order.sort(key=lambda k: float(grid.along[k]))
+        return Crossed(grid.along[order], grid.crosslines[order], len(closures), *_sds(P, place))
 
 
 def _worth(lines: Sequence[Line], crossing: Crossing, relief: Relief) -> Array:
@@ -283,7 +322,12 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
     if len(crossings) < ENOUGH:
         return []
     H = drift.between([c.knots for c, _ in crossings])
-    P, mean, left, closures = H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)), np.zeros(len(H)), [*range(len(crossings))], []
+    P, mean, left, closures = (
+        H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)),
+        np.zeros(len(H)),
+        [*range(len(crossings))],
+        [],
+    )
     while left:
         reach = [SIGMAS * float(np.sqrt(np.linalg.eigvalsh(P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])[-1])) for k in left]
         k = left.pop(int(np.argmin(reach)))
@@ -295,20 +339,10 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
     return closures if len(closures) >= ENOUGH else []
 
 
-def _on_lines(drift: Drift, lines: Sequence[Line]) -> Array:
-    """Knots within lines."""
-    return np.flatnonzero(np.any([(drift.time >= x.time[0]) & (drift.time <= x.time[-1]) for x in lines], axis=0))
-
-
-def _sd(drift: Drift, own: Array, place: Array | None = None) -> float:
-    """Horizontal, rms over some knots; with their places without shift, rotation and scale of all [m]."""
-    rows = (2 * own[:, None] + np.arange(2)).ravel()
-    P = drift.P[np.ix_(rows, rows)]
-    if place is not None:
-        x = place - place.mean(axis=0)
-        turned = np.stack([-x[:, 1], x[:, 0]], axis=-1)
-        shift = np.tile(np.eye(2), (len(x), 1))
-        Q = np.linalg.qr(np.column_stack([shift, x.ravel(), turned.ravel()]))[0]
-        P = P - Q @ (Q.T @ P)
-        P = P - (P @ Q) @ Q.T
-    return float(np.sqrt(np.trace(P).clip(min=0.0) / len(own)))
+def _sds(P: Array, place: Array) -> tuple[float, float]:
+    """Horizontal, rms over m places with a joint covariance, and without shift, rotation and scale of all [m]."""
+    x = place - place.mean(axis=0)
+    turned = np.stack([-x[:, 1], x[:, 0]], axis=-1)
+    Q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(x), 1)), x.ravel(), turned.ravel()]))[0]
+    whole, common = np.trace(P), np.trace(Q.T @ P @ Q)
+    return float(np.sqrt(whole / len(x))), float(np.sqrt(max(whole - common, 0.0) / len(x)))
