@@ -50,7 +50,8 @@ USUAL_RELIEF = Relief(0.35, 4.5, 0.15, np.inf)  # of a log without ranges: 1 m o
 OVER_M = 10.0  # that a crossline begins before the first line and ends behind the last
 ALONG = np.cos(np.pi / 6.0)  # of a line's course with that of the survey
 MOST_IMU_HZ = 50.0  # simulated; more tell no more of the drift
-STYLE, DEPTH_M = Style(waves=CALM), 5.0  # of the simulated dive
+STYLE = Style(smoothing=4.0, turning=4.0, waves=CALM)  # of the simulated dive: its turns take some 15 s
+DEPTH_M = 5.0
 PLACES = ("fix", "place", *ACOUSTICS)  # sensors that show places
 
 
@@ -335,7 +336,8 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
             break
         crossing, J = crossings[k]
         P = condition(mean, P, np.eye(2, len(H), 2 * k), J, np.zeros(2))[1]
-        closures.append(LoopClosure(crossing.knots, J, np.zeros(2)))
+        beside = J @ np.linalg.inv(np.eye(2) + JITTER_M**2 * J)  # or what lies between knots would show a rotation
+        closures.append(LoopClosure(crossing.knots, beside, np.zeros(2)))
     return closures if len(closures) >= ENOUGH else []
 
 
