@@ -268,7 +268,8 @@ def observe(
     for sentence in words(seen):
         say(shown, sentence)
     if result.crosslines is not None:
-        shown.print(crosslines_table(result.crosslines))
+        if len(result.crosslines.ranked) > 1:
+            shown.print(crosslines_table(result.crosslines))
         for sentence in crosslines_in_words(result.crosslines):
             say(shown, sentence)
     say(shown, f"results in {out}")

@@ -187,13 +187,13 @@ class Crossovers:
         return f"crossovers: {' and '.join(counts)} matched, by {relief}{chart}"
 
 
-def drift_of(estimate: Estimate) -> Drift:
-    """Errors of a smoothed track at its knots, by its joint covariance."""
+def drift_of(estimate: Estimate, also: Sequence[float] = ()) -> Drift:
+    """Errors of a smoothed track at its knots and at some more times, by its joint covariance."""
     track, posterior = estimate.trajectory, estimate.posterior
     assert posterior is not None
     apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
     times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
-    keyframes = np.unique(np.searchsorted(track.time, times).clip(max=len(track) - 1))
+    keyframes = np.unique(np.searchsorted(track.time, [*times, *also]).clip(max=len(track) - 1))
     return Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
 
 

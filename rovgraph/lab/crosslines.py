@@ -81,10 +81,9 @@ class CrosslinePlan:
 
     Attributes
     ----------
-    lines, length : of the survey, and of all of them together [m]
+    lines, length : parallel ones, and of all of them together [m]
     course : of its lines [rad]
     corner : ndarray, shape (2,), where they begin, north and east [m]
-    speed : [m/s]
     relief : of the bottom
     ranked : the dive as recorded, then with the best one, two and four; these only where the bottom shows relief
     """
@@ -93,7 +92,6 @@ class CrosslinePlan:
     length: float
     course: float
     corner: Array
-    speed: float
     relief: Relief
     ranked: Sequence[Crossed]
 
@@ -121,7 +119,9 @@ def plan_crosslines(
         raise InputError(f"{log.source}: crosslines are planned for dives without {' and '.join(shown) or 'places'}")
     lines, relief_there = _lines_and_relief(log, config, first, relief)
     grid = _Grid.of(log.source, lines)
-    recorded = _Driven(drift_of(first), lines, [None] * len(lines), first.trajectory, relief_there).crossed([])
+    recorded = _Driven(
+        drift_of(first, _crossing_times(lines)), lines, [None] * len(lines), first.trajectory, relief_there
+    ).crossed([])
     ranked = [recorded]
     if relief_there.shows:
         sources = tuple(SENSORS[s].heading_source for s in HEADING_STREAMS if s in dive.initial.streams)
@@ -129,8 +129,7 @@ def plan_crosslines(
         imu_hz = MOST_IMU_HZ if imu is None else float(1.0 / np.median(np.diff(imu.time)))
         rates = imu_hz, float(1.0 / np.median(np.diff(first.posterior.time)))
         ranked += _ranked(grid, config.with_values(heading={"sources": sources}), rates, relief_there, progress)
-    length = float(np.linalg.norm(grid.legs[:, 1] - grid.legs[:, 0], axis=1).sum())
-    return CrosslinePlan(len(lines), length, grid.course, grid.corner, grid.speed, relief_there, ranked)
+    return CrosslinePlan(grid.parallel, grid.length, grid.course, grid.corner, relief_there, ranked)
 
 
 def _lines_and_relief(
@@ -168,6 +167,7 @@ class _Grid:
     Attributes
     ----------
     legs : ndarray, shape (n, 2, 2), ends of its lines in the order of time [m]
+    parallel, length : how many of them are parallel, and how long these are together [m]
     corner, course : where the lines begin, and their course [rad]
     crosslines : ndarray, shape (k, 2, 2), as they are driven
     along : ndarray, shape (k,), where each crosses, along the lines from the corner [m]
@@ -175,6 +175,8 @@ class _Grid:
     """
 
     legs: Array
+    parallel: int
+    length: float
     corner: Array
     course: float
     crosslines: Array
@@ -203,7 +205,17 @@ class _Grid:
         lengths = np.linalg.norm(legs[:, 1] - legs[:, 0], axis=1)
         speed = float(np.median([n / np.ptp(line.centre[0]) for n, line in zip(lengths, lines, strict=True)]))
         half_width = float(np.median([line.centre[2] for line in lines]))
-        return _Grid(legs, low * u + (left + OVER_M) * v, course, np.array(ends), along, speed, half_width)
+        return _Grid(
+            legs,
+            int(own.sum()),
+            float(lengths[own].sum()),
+            low * u + (left + OVER_M) * v,
+            course,
+            np.array(ends),
+            along,
+            speed,
+            half_width,
+        )
 
     @property
     def route(self) -> Route:
@@ -286,7 +298,7 @@ class _Driven:
         track = estimate.trajectory
         lines = _swath(track.time, track.rpy[:, 2], track.p_n[:, :2], grid.half_width)
         which = [grid.crossline_at(float(line.time.mean())) for line in lines]
-        return _Driven(drift_of(estimate), lines, which, track, relief, grid)
+        return _Driven(drift_of(estimate, _crossing_times(lines)), lines, which, track, relief, grid)
 
     @cached_property
     def crossings(self) -> list[tuple[Crossing, Array]]:
@@ -310,6 +322,15 @@ class _Driven:
             return Crossed(np.empty(0), np.empty((0, 2, 2)), len(closures), *_sds(P, place))
         order.sort(key=lambda k: float(grid.along[k]))
         return Crossed(grid.along[order], grid.crosslines[order], len(closures), *_sds(P, place))
+
+
+def _crossing_times(lines: Sequence[Line]) -> list[float]:
+    """When lines are where they cross: knots beside them would make a shift of a rotation, and show it."""
+    still, times = Drift(np.zeros(1), np.zeros(2), np.zeros((2, 2))), list[float]()
+    for crossing in (c for k in range(1, len(lines)) for c in crossings_of(lines, k, still)):
+        t, place, _ = lines[crossing.earlier].centre
+        times += [crossing.time, float(t[np.linalg.norm(place - crossing.centre, axis=1).argmin()])]
+    return times
 
 
 def _worth(lines: Sequence[Line], crossing: Crossing, relief: Relief) -> Array:
@@ -336,7 +357,7 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
             break
         crossing, J = crossings[k]
         P = condition(mean, P, np.eye(2, len(H), 2 * k), J, np.zeros(2))[1]
-        beside = J @ np.linalg.inv(np.eye(2) + JITTER_M**2 * J)  # or what lies between knots would show a rotation
+        beside = J @ np.linalg.inv(np.eye(2) + JITTER_M**2 * J)
         closures.append(LoopClosure(crossing.knots, beside, np.zeros(2)))
     return closures if len(closures) >= ENOUGH else []
 

@@ -382,7 +382,9 @@ def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
             f"{plan.relief.noise:.2f} m."
         ]
     before, one = plan.ranked[0], plan.ranked[1]
-    north, east = plan.corner
+    if one.crossings <= before.crossings:
+        return ["A crossline would show nothing: its shift is too uncertain to look for, or it crosses too little."]
+    north, east = np.round(plan.corner) + 0.0
     where = " and ".join(f"{a:.0f} m" for a in one.along)
     return [
         f"A crossline {where} along the lines from {north:.0f} m north, {east:.0f} m east would leave "
