@@ -1,4 +1,4 @@
-"""Predicts by how much crosslines would reduce the drift of a survey: the work of ``rovgraph plan --survey``.
+"""Predicts by how much crosslines would reduce the drift of a survey: the work of ``rovgraph observe --crosslines``.
 
 The lines of a recorded dive and crosslines after them are simulated without noise, with the sensors of the dive, as
 manoeuvres are in `rovgraph.lab.plan`. The joint covariance of that track is conditioned on its crossings
