@@ -24,6 +24,7 @@ from rovgraph.inference.crossovers import (
     SIGMAS,
     Crossing,
     Drift,
+    Field,
     LoopClosure,
     condition,
     crossings_of,
@@ -336,6 +337,7 @@ def _crossing_times(lines: Sequence[Line]) -> list[float]:
 def _worth(lines: Sequence[Line], crossing: Crossing, relief: Relief) -> Array:
     """Information of a crossing's soundings on its shift, shape (2, 2) [1/m^2]."""
     field = field_at(lines, crossing, np.zeros(2), BESIDE_M, relief, None)
+    assert isinstance(field, Field)
     return field.expected_information()
 
 

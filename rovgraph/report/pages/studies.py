@@ -248,6 +248,14 @@ def observe_page(source: ResultsSource) -> str:
     items.insert(1, Panel("When the dive showed it", clock.label, "sd / prior sd", learning, note=note))
     words = [sentence(s) for s in seen["in_words"]]
     sections = [Section("known", "What can be known", words, items)]
+    if crosslines := seen.get("crosslines"):
+        rows = [
+            (len(c["ends_m"]), c["crossings"], f"{c['sd_m']:.2f}", f"{c['shape_sd_m']:.2f}")
+            for c in crosslines["ranking"]
+        ]
+        head = ("crosslines", "crossings", "sd [m]", "but for shift, rotation, scale [m]")
+        said = [sentence(s) for s in crosslines["in_words"]]
+        sections.append(Section("crosslines", "Crosslines", said, [PageTable("Drift of the survey", head, rows)]))
     return rendered(source, "What can be known", sections, clock)
 
 
