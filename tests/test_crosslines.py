@@ -133,8 +133,8 @@ def test_the_command_prints_and_keeps_what_crosslines_would_show(tmp_path):
     survey(tmp_path, lines=3)
     out = tmp_path / "seen"
     options = ["--config", str(tmp_path / "vehicle.yaml"), "--crosslines", "--out", str(out)]
-    code, _ = run_command(["observe", str(tmp_path / "log.csv"), *options])
-    assert code == 0
+    code, errors = run_command(["observe", str(tmp_path / "log.csv"), *options])
+    assert code == 0, errors
     kept = json.loads((out / "summary.json").read_text())["crosslines"]
     assert [len(row["ends_m"]) for row in kept["ranking"]] == [0, 1, 2, 4]
     assert "Drift of the survey" in (out / "report.html").read_text()
@@ -143,6 +143,6 @@ def test_the_command_prints_and_keeps_what_crosslines_would_show(tmp_path):
 
 @pytest.mark.parametrize("on", [False, True])
 def test_live_it_is_said_that_nothing_is_matched(on):
-    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 20.0, 1, "straight")
+    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 60.0, 1, "straight")
     said = [event.text for solution in flown(case).solutions for event in solution.events]
     assert any("crossovers and charts correct no live track" in text for text in said) == on

@@ -250,7 +250,7 @@ def observe_page(source: ResultsSource) -> str:
     sections = [Section("known", "What can be known", words, items)]
     if crosslines := seen.get("crosslines"):
         rows = [
-            (len(c["ends_m"]), c["crossings"], f"{c['sd_m']:.2f}", f"{c['shape_sd_m']:.2f}")
+            (str(len(c["ends_m"])), str(c["crossings"]), f"{c['sd_m']:.2f}", f"{c['shape_sd_m']:.2f}")
             for c in crosslines["ranking"]
         ]
         head = ("crosslines", "crossings", "sd [m]", "but for shift, rotation, scale [m]")
