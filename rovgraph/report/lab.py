@@ -385,7 +385,8 @@ def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
     if one.crossings <= before.crossings:
         return ["A crossline would show nothing: its shift is too uncertain to look for, or it crosses too little."]
     north, east = np.round(plan.corner) + 0.0
-    where, kind = " and ".join(f"{a:.0f} m" for a in one.along), "a" if np.isfinite(plan.relief.gain) else "an assumed"
+    where = " and ".join(f"{a:.0f} m" for a in one.along)
+    kind = "a" if np.isfinite(plan.relief.gain) else "an assumed"
     return [
         f"A crossline {where} along the lines from {north:.0f} m north, {east:.0f} m east would leave "
         f"{one.sd / before.sd:.0%} of the horizontal sd, if its crossings match by {kind} relief of {plan.relief.sd:.2f} m "
