@@ -389,8 +389,8 @@ def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
     kind = "a" if np.isfinite(plan.relief.gain) else "an assumed"
     return [
         f"A crossline {where} along the lines from {north:.0f} m north, {east:.0f} m east would leave "
-        f"{one.sd / before.sd:.0%} of the horizontal sd, if its crossings match by {kind} relief of {plan.relief.sd:.2f} m "
-        f"over {plan.relief.length:.1f} m and soundings of {plan.relief.noise:.2f} m.",
+        f"{one.sd / before.sd:.0%} of the horizontal sd, if its crossings match by {kind} relief of "
+        f"{plan.relief.sd:.2f} m over {plan.relief.length:.1f} m and soundings of {plan.relief.noise:.2f} m.",
         "No crossline shows a shift, a rotation or a scale of the whole survey; these need position fixes.",
     ]
 
