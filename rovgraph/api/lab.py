@@ -23,6 +23,7 @@ from rovgraph.lab.calibrate import BeamFit, MagnetometerCalibration, NoiseReport
 from rovgraph.lab.choices import goals as read_goals
 from rovgraph.lab.choices import listed, read_known
 from rovgraph.lab.compare import Comparison
+from rovgraph.lab.crosslines import CrosslinePlan, plan_crosslines
 from rovgraph.lab.estimators import select
 from rovgraph.lab.evaluate import read_reference
 from rovgraph.lab.misalignment import Tables, chosen, open_results, read_study
@@ -248,12 +249,14 @@ class ObservabilityResult(LabResult):
     config : of vehicle and sensors, including the variables estimated
     warnings : findings on the log, a line each
     about : its inputs, for ``summary.json``
+    crosslines : what they would show of the track's drift, if that was asked
     """
 
     observability: Observability
     config: Config
     warnings: tuple[str, ...]
     about: Mapping[str, Any]
+    crosslines: CrosslinePlan | None = None
 
     @property
     def verdicts(self) -> Mapping[str, str]:
@@ -266,7 +269,7 @@ class ObservabilityResult(LabResult):
         from rovgraph.report.lab import write_observability
 
         draw_observability(folder, self.observability)
-        write_observability(folder, self.observability, self.config, self.about)
+        write_observability(folder, self.observability, self.config, self.about, self.crosslines)
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,12 @@ class PlanResult(LabResult):
 
 
 def observe(
-    log: Log, config: Config | None = None, estimate: str | Sequence[str] = (), progress: Progress = no_progress
+    log: Log,
+    config: Config | None = None,
+    estimate: str | Sequence[str] = (),
+    progress: Progress = no_progress,
+    crosslines: bool = False,
+    relief: tuple[float, float] | None = None,
 ) -> ObservabilityResult:
     """Determine how well a dive shows each calibration variable, when it did, and what is missing.
 
@@ -304,10 +312,14 @@ def observe(
     config : of vehicle and sensors; None = all defaults
     estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     progress : called at times with the current task and its progress from 0 to 1
+    crosslines : predict what crosslines would show of the track's drift, too
+    relief : sd and correlation length of the bottom's relief for that, where the log has no ranges [m]; None =
+        0.35 over 4.5
 
     Raises
     ------
-    InputError : an unknown variable, one whose sensor is not used, no variable at all, a log that cannot be used
+    InputError : an unknown variable, one whose sensor is not used, no variable at all, a log that cannot be used; a
+        dive that crosslines cannot be planned for
 
     Warns
     -----
@@ -315,11 +327,14 @@ def observe(
     """
     estimate = listed(estimate)
     config = estimating(config_of(log, config), estimate)
+    if relief is not None and not (crosslines and min(relief) > 0.0):
+        raise InputError(f"relief {relief}: it goes with crosslines, and sd and length of more than 0 m are expected")
     with collected_warnings() as texts:
         log, _ = prepared(log, config)
         seen = observe_calibration(log, config, estimate, progress)
+        crossed = plan_crosslines(log, config, relief, progress) if crosslines else None
     about = {"log": log.source, "estimate": [*estimate]}
-    return ObservabilityResult(seen, config, (*log.warnings, *texts), about)
+    return ObservabilityResult(seen, config, (*log.warnings, *texts), about, crossed)
 
 
 def plan(

@@ -229,6 +229,18 @@ def observe(
     estimate: Annotated[
         str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
+    crosslines: Annotated[
+        bool, typer.Option("--crosslines", help="predict what crosslines would show of the track's drift")
+    ] = False,
+    relief: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="crosslines: sd and correlation length of the bottom's relief in m, of a log without ranges; "
+            "default: 0.35 4.5",
+            metavar="SD LENGTH",
+            show_default=False,
+        ),
+    ] = None,
     force: Force = False,
     choose: Choose = None,
     shift: Shift = None,
@@ -241,20 +253,25 @@ def observe(
     import rovgraph as rg
     from rovgraph.cli.console import console, progress_bar, say
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.lab import observability_table, words
+    from rovgraph.report.lab import crosslines_in_words, crosslines_table, observability_table, words
 
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     check_writable(out, force, [*files, config])
     dive_log = read_files(files, settings, choose, shift, times)
     with progress_bar() as progress:
-        result = rg.observe(dive_log, settings, estimate or (), progress)
+        result = rg.observe(dive_log, settings, estimate or (), progress, crosslines, relief)
     result.save(out, force)
     seen = result.observability
     shown = console(OBSERVATION_WIDTH)
     shown.print(observability_table(seen, f"what {files[0].name} shows"))
     for sentence in words(seen):
         say(shown, sentence)
+    if result.crosslines is not None:
+        if len(result.crosslines.ranked) > 1:
+            shown.print(crosslines_table(result.crosslines))
+        for sentence in crosslines_in_words(result.crosslines):
+            say(shown, sentence)
     say(shown, f"results in {out}")
 
 

@@ -187,6 +187,16 @@ class Crossovers:
         return f"crossovers: {' and '.join(counts)} matched, by {relief}{chart}"
 
 
+def drift_of(estimate: Estimate, also: Sequence[float] = ()) -> Drift:
+    """Errors of a smoothed track at its knots and at some more times, by its joint covariance."""
+    track, posterior = estimate.trajectory, estimate.posterior
+    assert posterior is not None
+    apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
+    times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
+    keyframes = np.unique(np.searchsorted(track.time, [*times, *also]).clip(max=len(track) - 1))
+    return Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
+
+
 def with_crossovers(
     estimate: Estimate, bottom: Bottom, beliefs: Mapping[str, Belief], chart: ChartFile | None, origin: Origin
 ) -> tuple[Estimate, Crossovers]:
@@ -202,15 +212,10 @@ def with_crossovers(
     beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
-    track, posterior = estimate.trajectory, estimate.posterior
-    assert posterior is not None
-    apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
-    times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
-    keyframes = np.unique(np.searchsorted(track.time, times).clip(max=len(track) - 1))
+    track, drift = estimate.trajectory, drift_of(estimate)
     used = bottom.soundings[bottom.soundings["used"] == 1]
     soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
-    drift = Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
     around, place = None, beliefs[CHART_PLACE]
     if chart is not None:
         drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
@@ -352,6 +357,20 @@ class Field:
         parts = [shifts[k : k + 256] for k in range(0, len(shifts), 256)]
         L, misfit = np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts])
         return L - self._none, misfit
+
+    def expected_information(self) -> Array:
+        """Fisher's information on the shift where there is none, shape (2, 2) [1/m^2]: what a match is worth."""
+        h = 0.1 * self._relief.length
+        shifts = h * np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+        none, *moved = self._common(self._x, self._y, shifts)
+        n, root = len(self._x), np.linalg.inv(self._root)
+        weight = np.linalg.inv(np.block([[self._own, none], [none.T, root @ root.T]]))
+        by = np.zeros((2, *weight.shape))
+        for one, ahead, behind in zip(by, moved[::2], moved[1::2], strict=True):
+            one[:n, n:] = (ahead - behind) / (2.0 * h)
+            one[n:, :n] = one[:n, n:].T
+        by = weight @ by
+        return np.asarray(0.5 * np.einsum("aij,bji->ab", by, by))
 
 
 def field_at(

@@ -337,6 +337,9 @@ class Navigator:
             self.say("start", "assumed", text)
         for text in self._startup.doubts:
             self.say("start", "warning", text)
+        if config.graph.crossovers or config.chart.file is not None:
+            text = "crossovers and charts correct no live track, after a crossline neither; smooth the recorded log"
+            self.say("start", "warning", text)
         self._located |= any(m.sensor == "fix" for m in self._startup.measurements)
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)

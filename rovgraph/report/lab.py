@@ -16,6 +16,7 @@ from rich.table import Table
 
 from rovgraph.inference.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE
 from rovgraph.lab.compare import Comparison
+from rovgraph.lab.crosslines import CrosslinePlan
 from rovgraph.lab.misalignment import Study, Tables
 from rovgraph.lab.observability import OTHER_LABELS, Observability, directions, in_words
 from rovgraph.lab.plan import Plan
@@ -260,7 +261,13 @@ OBSERVABILITY, PLAN = "observability.json", "plan.json"
 TOLD = 12  # correlations in the table's caption
 
 
-def write_observability(folder: Path, seen: Observability, config: Config, about: Mapping[str, Any]) -> None:
+def write_observability(
+    folder: Path,
+    seen: Observability,
+    config: Config,
+    about: Mapping[str, Any],
+    crosslines: CrosslinePlan | None = None,
+) -> None:
     """Write every file of ``rovgraph observe`` but the figures.
 
     Parameters
@@ -269,8 +276,11 @@ def write_observability(folder: Path, seen: Observability, config: Config, about
     seen : of `rovgraph.lab.observability.observe`
     config : what was believed
     about : what it was made of, for summary.json
+    crosslines : what they would show of the track's drift, if that was asked
     """
     content = observability_as_dict(seen)
+    if crosslines is not None:
+        about = {**about, "crosslines": crosslines_as_dict(crosslines)}
     _write(folder / OBSERVABILITY, {**STAMP, **about, **content})
     verdicts = {label: entry["verdict"] for label, entry in content["components"].items()}
     _write(folder / SUMMARY, {**STAMP, **about, "verdicts": verdicts, "in_words": content["in_words"]})
@@ -336,6 +346,53 @@ def observability_table(seen: Observability, title: str) -> Table:
     pairs = ", ".join(f"{a} with {b} {rho:+.2f}" for a, b, rho in seen.correlated()[:TOLD])
     table.caption = f"{seen.joint_bits:.1f} bits in all. Correlations beyond 0.5: {pairs or 'none'}"
     return table
+
+
+def crosslines_as_dict(plan: CrosslinePlan) -> dict[str, Any]:
+    """What observability.json and summary.json hold of crosslines."""
+    return {
+        "relief_sd_m": plan.relief.sd,
+        "relief_length_m": plan.relief.length,
+        "noise_m": plan.relief.noise,
+        "in_words": crosslines_in_words(plan),
+        "ranking": [
+            {"ends_m": c.ends, "crossings": c.crossings, "sd_m": c.sd, "shape_sd_m": c.shape_sd} for c in plan.ranked
+        ],
+    }
+
+
+def crosslines_table(plan: CrosslinePlan) -> Table:
+    """A row per number of crosslines."""
+    title = f"crosslines of {plan.lines} lines, {plan.length:.0f} m, towards {np.rad2deg(plan.course) % 360.0:.0f}°"
+    table = Table(title=escape(title), title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=0)
+    for heading in ("crosslines", "along the lines [m]", "crossings", "sd [m]", "but for shift, rotation, scale [m]"):
+        table.add_column(escape(heading), justify="right")
+    for c in plan.ranked:
+        where = ", ".join(f"{a:.0f}" for a in c.along)
+        count = str(len(c.along)) if len(c.along) else "as recorded"
+        table.add_row(count, where, str(c.crossings), f"{c.sd:.2f}", f"{c.shape_sd:.2f}")
+    return table
+
+
+def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
+    """What they would show, and what not, a sentence each."""
+    if len(plan.ranked) == 1:
+        return [
+            f"Crosslines would show nothing: the bottom shows no relief above the noise of its soundings, "
+            f"{plan.relief.noise:.2f} m."
+        ]
+    before, one = plan.ranked[0], plan.ranked[1]
+    if one.crossings <= before.crossings:
+        return ["A crossline would show nothing: its shift is too uncertain to look for, or it crosses too little."]
+    north, east = np.round(plan.corner) + 0.0
+    where = " and ".join(f"{a:.0f} m" for a in one.along)
+    kind = "a" if np.isfinite(plan.relief.gain) else "an assumed"
+    return [
+        f"A crossline {where} along the lines from {north:.0f} m north, {east:.0f} m east would leave "
+        f"{one.sd / before.sd:.0%} of the horizontal sd, if its crossings match by {kind} relief of "
+        f"{plan.relief.sd:.2f} m over {plan.relief.length:.1f} m and soundings of {plan.relief.noise:.2f} m.",
+        "No crossline shows a shift, a rotation or a scale of the whole survey; these need position fixes.",
+    ]
 
 
 def write_plan(folder: Path, plan: Plan, config: Config, about: Mapping[str, Any]) -> None:

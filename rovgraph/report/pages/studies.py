@@ -248,7 +248,20 @@ def observe_page(source: ResultsSource) -> str:
     items.insert(1, Panel("When the dive showed it", clock.label, "sd / prior sd", learning, note=note))
     words = [sentence(s) for s in seen["in_words"]]
     sections = [Section("known", "What can be known", words, items)]
+    if "crosslines" in seen:
+        sections.append(_crosslines(seen["crosslines"]))
     return rendered(source, "What can be known", sections, clock)
+
+
+def _crosslines(seen: Mapping[str, Any]) -> Section:
+    """What crosslines would leave of a survey's drift."""
+    head = ("crosslines", "crossings", "sd [m]", "but for shift, rotation, scale [m]")
+    rows = [
+        (str(len(c["ends_m"])), str(c["crossings"]), f"{c['sd_m']:.2f}", f"{c['shape_sd_m']:.2f}")
+        for c in seen["ranking"]
+    ]
+    words = [sentence(s) for s in seen["in_words"]]
+    return Section("crosslines", "Crosslines", words, [PageTable("Drift of the survey", head, rows)])
 
 
 def plan_page(source: ResultsSource) -> str:

@@ -1,0 +1,148 @@
+"""What crosslines would show of a survey's drift is predicted as surveys with crosslines then have it."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from crossovers import Relief as Ground
+from crossovers import flat, matern, path, survey_motion
+from dives import simulated
+from fault_campaign.beams import Beams, stated
+from fault_campaign.campaign import merge
+from fault_campaign.instruments import sample
+from fault_campaign.judge import Dive, run_command, write_dive
+from fault_campaign.vehicle import Compass, configuration, make_vehicle
+from live import flown
+
+import rovgraph as rg
+from rovgraph.inference.crossovers import Drift, Field, crossings_of
+from rovgraph.inference.relief import Relief
+from rovgraph.lab.crosslines import _crossing_times, _matched, _swath, _worth, plan_crosslines
+from rovgraph.report.lab import crosslines_in_words
+
+RELIEF = Relief(0.35, 4.5, 0.1, np.inf)
+
+
+def survey(folder: Path, ground=matern, lines: int = 5, crosslines: int = 0, crossovers: bool = True) -> Dive:
+    """Lines of 120 m, 25 m apart, of an independent simulator."""
+    rng, vehicle = np.random.default_rng([46, 1]), make_vehicle("mti", ("ahrs", "depth"))
+    beams = Beams(bottom=Ground(20.0, terrain=ground(rng)))
+    vehicle.dvl = replace(
+        vehicle.dvl, mount_rpy_deg=(0.0, 0.0, -45.0), yaw_sd=0.3, scale_sd=0.003, sd=beams.head.velocity_sd
+    )
+    vehicle.dvl.rate, vehicle.imu.rate = 2.0, 50.0
+    vehicle.ahrs = Compass(offset_sd=0.5, curve_sd=0.5)
+    motion = survey_motion(lines, 120.0, 25.0, crosslines)
+    config = merge(configuration(vehicle), stated(beams.head))
+    config = merge(config, {"graph": {"crossovers": crossovers}, "calibration": {"dvl_scale": {"sd": 0.003}}})
+    streams, hidden = sample(motion, vehicle, rng, beams)
+    dive = Dive(streams, config, motion, hidden)
+    folder.mkdir(exist_ok=True)
+    write_dive(dive, folder)
+    return dive
+
+
+def read(folder: Path):
+    config = rg.load_config(folder / "vehicle.yaml")
+    return rg.read_log(folder / "log.csv", config), config
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_predicted_sd_is_that_of_a_survey_with_these_crosslines(tmp_path, count):
+    survey(tmp_path / "without")
+    plan = plan_crosslines(*read(tmp_path / "without"))
+    with_none, predicted = plan.ranked[0], next(c for c in plan.ranked if len(c.along) == count)
+    survey(tmp_path / "with", crosslines=count)
+    track = rg.smooth(*read(tmp_path / "with")).smoothed
+    end = survey_motion(5, 120.0, 25.0, 0).duration
+    P = track.trajectory.cov_p[track.trajectory.time < end]
+    sd = np.sqrt(np.mean(P[:, 0, 0] + P[:, 1, 1]))
+    assert with_none.crossings == 0 and predicted.crossings >= 5 * count
+    assert predicted.sd == pytest.approx(sd, rel=0.25)
+    assert predicted.sd < 0.8 * with_none.sd
+
+
+@pytest.mark.slow
+def test_over_a_flat_bottom_crosslines_show_nothing(tmp_path):
+    survey(tmp_path, flat, lines=3)
+    plan = plan_crosslines(*read(tmp_path))
+    assert len(plan.ranked) == 1
+    (line,) = crosslines_in_words(plan)
+    assert line.startswith("Crosslines would show nothing: the bottom shows no relief")
+
+
+@pytest.mark.slow
+def test_what_cannot_be_planned_is_refused(tmp_path):
+    survey(tmp_path, lines=2)
+    log, config = read(tmp_path)
+    with pytest.raises(rg.InputError, match="3 parallel lines or more is needed, found 2"):
+        plan_crosslines(log, config)
+    with pytest.raises(rg.InputError, match="its ranges show the relief of the bottom"):
+        plan_crosslines(log, config, (0.3, 4.0))
+    with pytest.raises(rg.InputError, match="it goes with crosslines"):
+        rg.observe(log, config, relief=(0.3, 4.0))
+    with pytest.raises(rg.InputError, match="more than 0 m are expected"):
+        rg.observe(log, config, crosslines=True, relief=(0.3, -4.0))
+
+
+def test_a_match_is_worth_the_mean_curvature_of_its_field():
+    rng = np.random.default_rng(7)
+    s = np.arange(-7.0, 8.0, 2.0)
+    x, y = (np.array([(a, b) if k else (b, a) for a in s for b in (-2.0, 0.0, 2.0)]) for k in (0, 1))
+    both = np.vstack([x, y])
+    r = np.linalg.norm(both[:, None] - both, axis=2)
+    root = np.linalg.cholesky(RELIEF.covariance(r) + RELIEF.noise**2 * np.eye(len(r)))
+    h, curvature = 0.1, np.zeros((2, 2))
+    shifts = h * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1), (0, 0)], float)
+    for _ in range(200):
+        z = root @ rng.standard_normal(len(r))
+        L = Field((x, z[: len(x)]), (y, z[len(x) :]), RELIEF).at(shifts)[0] / h**2
+        cross = -(L[0] - L[1] - L[2] + L[3]) / 4.0
+        curvature += np.array([[2 * L[8] - L[4] - L[5], cross], [cross, 2 * L[8] - L[6] - L[7]]]) / 200.0
+    J = Field((x, z[: len(x)]), (y, z[len(x) :]), RELIEF).expected_information()
+    assert np.abs(J - curvature).max() < 0.2 * np.trace(J) / 2.0
+
+
+def test_crossings_show_no_rotation_of_the_survey_however_many():
+    p, angle = path(5, 120.0, 25.0, 4), 0.02
+    way = np.gradient(p, axis=0)
+    t = np.arange(len(p), dtype=float)
+    lines = _swath(t, np.arctan2(way[:, 1], way[:, 0]), p, 4.0)
+    knots = np.unique(np.round([*t[::10], *_crossing_times(lines)]))
+    place = np.stack([np.interp(knots, t, axis) for axis in p.T], axis=-1)
+    turned = angle * np.stack([-place[:, 1], place[:, 0]], axis=-1).ravel()
+    walk = 1e-3 * np.kron(np.minimum.outer(knots, knots) + 1e-2, np.eye(2))
+    drift = Drift(knots, np.zeros(2 * len(knots)), np.outer(turned, turned) + walk)
+    crossings = [(c, _worth(lines, c, RELIEF)) for k in range(1, len(lines)) for c in crossings_of(lines, k, drift)]
+    left = drift.given(_matched(drift, crossings))
+    M = np.column_stack([turned / angle, np.tile(np.eye(2), (len(knots), 1))])
+    by = np.linalg.pinv(M)[0]
+    assert len(crossings) >= 20
+    assert np.sqrt(by @ left.P @ by) > 0.85 * angle
+
+
+@pytest.mark.slow
+def test_the_command_prints_and_keeps_what_crosslines_would_show(tmp_path):
+    survey(tmp_path, lines=3)
+    out = tmp_path / "seen"
+    options = ["--config", str(tmp_path / "vehicle.yaml"), "--crosslines", "--out", str(out)]
+    code, errors = run_command(["observe", str(tmp_path / "log.csv"), *options])
+    assert code == 0, errors
+    kept = json.loads((out / "summary.json").read_text())["crosslines"]
+    assert [len(row["ends_m"]) for row in kept["ranking"]] == [0, 1, 2, 4]
+    assert "Drift of the survey" in (out / "report.html").read_text()
+    assert kept["in_words"][-1].startswith("No crossline shows a shift, a rotation or a scale")
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_live_it_is_said_that_nothing_is_matched(on):
+    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 60.0, 1, "straight")
+    said = [event.text for solution in flown(case).solutions for event in solution.events]
+    assert any("crossovers and charts correct no live track" in text for text in said) == on
