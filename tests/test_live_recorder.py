@@ -40,6 +40,14 @@ def read_quietly(path: Path, **how: bool):
         return read_log(path, **how)
 
 
+def test_a_recording_has_one_writer(tmp_path):
+    first = Recorder(tmp_path / "r.csv")
+    with pytest.raises(InputError, match="another run is recording there"):
+        Recorder(tmp_path / "r.csv")
+    first.close()
+    Recorder(tmp_path / "r.csv").close()
+
+
 def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
     """With all their optional columns, and no warning about the columns that stayed empty."""
     recorder = Recorder(tmp_path / "r.csv")

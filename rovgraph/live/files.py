@@ -15,6 +15,7 @@ stands as ``{"$array": [dtype, shape, offset]}``; the arrays' bytes. Reading it 
 """
 
 import contextlib
+import fcntl
 import hashlib
 import io
 import json
@@ -340,17 +341,20 @@ def _opened(path: Path, first_line: bytes) -> int:
 
     Raises
     ------
-    InputError : the file cannot be written, or is no recording
+    InputError : the file cannot be written, is no recording, or another run has it
     """
     file = None
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0), 0o644)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, or its program ends
         _continue(path, file, first_line)
     except (OSError, InputError) as error:
         if file is not None:
             os.close(file)
         if isinstance(error, InputError):
             raise
+        if isinstance(error, BlockingIOError):
+            raise InputError(f"{path}: another run is recording there; end it, or choose another folder") from None
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file to record to") from None
     return file
 
