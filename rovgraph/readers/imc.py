@@ -86,7 +86,7 @@ ACOUSTIC = {kind for kind, _ in NAMED.values()}
 WANTED = {*PLAIN, *NAMED, ENTITY_INFO, LBL_CONFIG}
 
 
-class Source(NamedTuple):
+class Sender(NamedTuple):
     """Where messages come from: kind, system, entity, target; "" without one."""
 
     kind: str
@@ -95,7 +95,7 @@ class Source(NamedTuple):
     target: str = ""
 
 
-class Rows(NamedTuple):
+class MessageSeries(NamedTuple):
     """Messages of one source: their times, increasing, shape (n,), and fields, shape (n,)."""
 
     time: Array
@@ -195,7 +195,7 @@ class Messages:
 
     def __init__(self, content: mmap.mmap, left: Counter[tuple[str, str]]) -> None:
         self._content, self._left = content, left
-        self._found: dict[Source, tuple[array[float], array[int]]] = {}
+        self._found: dict[Sender, tuple[array[float], array[int]]] = {}
         self.entities: dict[tuple[int, int], str] = {}
         self.beacons: list[tuple[str, float, float, float]] = []
 
@@ -217,7 +217,7 @@ class Messages:
         kind, layout = (PLAIN | NAMED)[packet.number]
         target, at = _text(self._content, packet.at) if packet.number in NAMED else ("", packet.at)
         if end - at == layout.itemsize and np.isfinite(packet.time):
-            source = Source(kind, packet.system, packet.entity, target)
+            source = Sender(kind, packet.system, packet.entity, target)
             times, places = self._found.setdefault(source, (array("d"), array("q")))
             times.append(packet.time)
             places.append(at)
@@ -234,27 +234,27 @@ class Messages:
             at += struct.calcsize("<ddfBBB")
         self.beacons = found or self.beacons
 
-    def count(self, source: Source) -> int:
+    def count(self, source: Sender) -> int:
         return len(self._found[source][0])
 
     @property
-    def sources(self) -> list[Source]:
+    def sources(self) -> list[Sender]:
         """The most frequent first."""
         return sorted(self._found, key=lambda source: -self.count(source))
 
-    def rows(self, source: Source) -> Rows:
+    def rows(self, source: Sender) -> MessageSeries:
         """The messages of a source, one at a time."""
         times, places = self._found[source]
         layout = next(layout for kind, layout in (PLAIN | NAMED).values() if kind == source.kind)
         values, _ = gathered(self._content, layout, places, [layout.itemsize] * len(places), layout.itemsize)
         time, first = np.unique(np.array(times), return_index=True)
-        return Rows(time, values[first])
+        return MessageSeries(time, values[first])
 
-    def of(self, kind: str) -> list[Source]:
+    def of(self, kind: str) -> list[Sender]:
         """Sources of a kind, the most frequent first."""
         return [source for source in self.sources if source.kind == kind]
 
-    def label(self, source: Source) -> str:
+    def label(self, source: Sender) -> str:
         """A name of a source, as options choose it."""
         if source.target:
             return f"{source.kind} {source.target}"
@@ -306,15 +306,15 @@ class _Reader:
             settings["heading"] = {"ahrs_reference" if self._own("AngularVelocity") else "vehicle_reference": "true"}
         return [*out, *replies, *ranges, *fixes], settings, said
 
-    def _own(self, kind: str) -> list[Source]:
+    def _own(self, kind: str) -> list[Sender]:
         return [source for source in self.messages.of(kind) if source.system == self.own]
 
-    def _chosen(self, sensor: str, kind: str) -> list[Source]:
+    def _chosen(self, sensor: str, kind: str) -> list[Sender]:
         """Own sources of a kind, the preferred one first."""
         by_label = {self.messages.label(source): source for source in self._own(kind)}
         return [by_label[label] for label in preferred_first(self.path, sensor, list(by_label), self.choose)]
 
-    def _channel(self, sensor: str, source: Source, columns: Mapping[str, Array], frame: str = "") -> Channel:
+    def _channel(self, sensor: str, source: Sender, columns: Mapping[str, Array], frame: str = "") -> Channel:
         return Channel(sensor, columns, self.messages.label(source), frame, CLOCK)
 
     # of the vehicle
@@ -339,7 +339,7 @@ class _Reader:
             out.append(self._channel("depth", source, {"time": rows.time, "depth": rows.values["depth"].astype(float)}))
         return out + self._attitude("ahrs" if any(channel.sensor == "imu" for channel in out) else "vehicle_heading")
 
-    def _inertial(self, source: Source) -> dict[str, Array]:
+    def _inertial(self, source: Sender) -> dict[str, Array]:
         """Rates, and acceleration of the same entity at their times; {} without."""
         force = next((s for s in self._own("Acceleration") if s.entity == source.entity), None)
         if force is None:
@@ -407,12 +407,12 @@ class _Reader:
                 made.append(self._channel("usbl", source, columns, AXES["transducer"]))
         return made
 
-    def _range(self, source: Source) -> dict[str, Array]:
+    def _range(self, source: Sender) -> dict[str, Array]:
         rows = self.messages.rows(source)
         beacon, distance = (rows.values[name].astype(float) for name in ("id", "range"))
         return {"time": rows.time, "range": distance, "range_beacon": beacon}
 
-    def _gps(self, source: Source) -> dict[str, Array]:
+    def _gps(self, source: Sender) -> dict[str, Array]:
         rows = self.messages.rows(source)
         valid = (rows.values["valid"] & POSITION_VALID > 0) & ~np.isin(rows.values["type"], RECKONED)
         values = rows.values[valid]

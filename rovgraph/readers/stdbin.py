@@ -101,7 +101,7 @@ class Frame(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Rows:
+class BlockSeries:
     """What all frames hold in one block.
 
     Attributes
@@ -117,12 +117,12 @@ class Rows:
         """Along the axes forward, port, up, shape (n, 3)."""
         return np.column_stack([self.values[axis].astype(float) for axis in "xyz"])
 
-    def fresh(self) -> "Rows":
+    def fresh(self) -> "BlockSeries":
         """By the times of its own, in their order, each time once."""
         own = TICK_S * self.values["time"].astype(float)
         time = self.time + (own - self.time + 0.5 * DAY_S) % DAY_S - 0.5 * DAY_S
         time, first = np.unique(time.round(5), return_index=True)
-        return Rows(time, self.values[first])
+        return BlockSeries(time, self.values[first])
 
 
 class Stdbin:
@@ -155,7 +155,7 @@ class Stdbin:
         blocks = {}
         for block, (row, values) in found.items():
             set_ = np.isfinite(steady[row])
-            blocks[block] = Rows(steady[row][set_], values[set_])
+            blocks[block] = BlockSeries(steady[row][set_], values[set_])
         channels, settings, said = _channels(path, options, blocks, left)
         if not channels:
             raise InputError(f"{path}: its frames hold nothing that a log has; have the unit send its external sensors")
@@ -238,7 +238,7 @@ def _clock(
 
 
 def _channels(
-    path: Path, options: ReadingOptions, blocks: Mapping[Block, Rows], left: Counter[tuple[str, str]]
+    path: Path, options: ReadingOptions, blocks: Mapping[Block, BlockSeries], left: Counter[tuple[str, str]]
 ) -> tuple[list[Channel], dict[str, Any], list[str]]:
     """Channels, settings for them, and what may be wrong."""
     for block, why in LEFT.items():
@@ -269,7 +269,7 @@ def _channel(sensor: str, source: str, columns: Mapping[str, Array], frame: str 
 Found = tuple[list[Channel], dict[str, Any]]  # channels, and settings for them
 
 
-def _inertial(blocks: Mapping[Block, Rows], left: Counter[tuple[str, str]]) -> Found:
+def _inertial(blocks: Mapping[Block, BlockSeries], left: Counter[tuple[str, str]]) -> Found:
     """Specific force and rate, where the unit gives them with all their digits."""
     force, rate = blocks.get(("navigation", 28)), blocks.get(("extended", 2))
     if force is None or rate is None or not np.array_equal(force.time, rate.time):
@@ -285,7 +285,7 @@ def _inertial(blocks: Mapping[Block, Rows], left: Counter[tuple[str, str]]) -> F
     return [channel], {"imu": {"mount_rpy_deg": [180.0, 0.0, 0.0]}}
 
 
-def _attitude(blocks: Mapping[Block, Rows], left: Counter[tuple[str, str]]) -> Found:
+def _attitude(blocks: Mapping[Block, BlockSeries], left: Counter[tuple[str, str]]) -> Found:
     """The unit's heading, roll and pitch, once it has found north."""
     if ("navigation", 0) not in blocks:
         return [], {}
@@ -305,7 +305,7 @@ def _attitude(blocks: Mapping[Block, Rows], left: Counter[tuple[str, str]]) -> F
     return [turn, tilt], {"heading": {"vehicle_reference": "true"}}
 
 
-def _doppler(blocks: Mapping[Block, Rows]) -> Found:
+def _doppler(blocks: Mapping[Block, BlockSeries]) -> Found:
     """Bottom and water track of the first DVL that has them."""
     out: list[Channel] = []
     settings: dict[str, Any] = {}
@@ -336,7 +336,7 @@ def _name(text: bytes) -> str:
     return text.partition(b"\0")[0].decode("ascii", "replace").strip()
 
 
-def _ranges(blocks: Mapping[Block, Rows]) -> tuple[list[Channel], list[str]]:
+def _ranges(blocks: Mapping[Block, BlockSeries]) -> tuple[list[Channel], list[str]]:
     """Ranges to beacons, and what states where these are."""
     parts = [blocks["external", bit].fresh() for bit in (14, 15, 16, 17) if ("external", bit) in blocks]
     if not parts:
@@ -365,7 +365,7 @@ def _signed(longitude: float) -> float:
     return (longitude + 180.0) % 360.0 - 180.0
 
 
-def _fixes(path: Path, options: ReadingOptions, blocks: Mapping[Block, Rows]) -> list[Channel]:
+def _fixes(path: Path, options: ReadingOptions, blocks: Mapping[Block, BlockSeries]) -> list[Channel]:
     """Fixes by transponder and receiver, those of transponders before those of satellites, the most first."""
     made: dict[str, tuple[bool, Channel]] = {}
     for bit in (6, 7, 8, 1, 2):
