@@ -29,7 +29,9 @@ def knots_walking_faster(best: ChainOptimum) -> dict[str, Belief]:
     if losses[0] - losses[-2] < CLEAR:
         return {}
     slower, likeliest, faster = losses[-3:]
-    beyond = 0.5 * (slower - faster) / (slower - 2.0 * likeliest + faster)  # of a parabola through the three
+    beyond = 1.0  # where the fastest that was tried is the likeliest; else of a parabola through the three
+    if faster >= likeliest:
+        beyond = 0.5 * (slower - faster) / (slower - 2.0 * likeliest + faster)
     factor = TOGETHER * STEP ** (len(losses) - 3 + beyond)
     return _walking(best, names, factor) if factor > WORTH else {}
 
