@@ -19,6 +19,8 @@ are iterated (Huber 1964; Zhang 1997): weights follow from the residuals after t
 cost, not from the innovations, which a wide prior makes large. The covariance is Joseph's,
 P <- (I - K H) P (I - K H)' + K K', multiplied out so that it costs products of rank m only.
 
+What multiplies the DVL's velocity is linearised between prediction and correction (`draw_no_scale`).
+
 A considered variable is uncertain and never corrected, nor does it move a gain or a gate. Its part of the estimate's
 error is B y, y white and of unit variance, so that the covariance of the estimate is P + B B'. With H_y the Jacobian by
 y,

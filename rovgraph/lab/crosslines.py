@@ -346,12 +346,8 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
     if len(crossings) < ENOUGH:
         return []
     H = drift.between([c.knots for c, _ in crossings])
-    P, mean, left, closures = (
-        H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)),
-        np.zeros(len(H)),
-        [*range(len(crossings))],
-        [],
-    )
+    P, mean = H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)), np.zeros(len(H))
+    left, closures = [*range(len(crossings))], list[LoopClosure]()
     while left:
         reach = [SIGMAS * float(np.sqrt(np.linalg.eigvalsh(P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])[-1])) for k in left]
         k = left.pop(int(np.argmin(reach)))
