@@ -23,7 +23,9 @@ def knots_walking_faster(best: ChainOptimum) -> dict[str, Belief]:
     names = [name for name in LAYERS if name in best.chain.layout.walking]
     if not names:
         return {}
-    losses = [_loss(best, _walking(best, names, 1.0 / STEP)), _loss(best, {})]
+    log_determinant, least = best.linear
+    believed = freedom(best.chain, log_determinant) + 0.5 * least
+    losses = [_loss(best, _walking(best, names, 1.0 / STEP)), believed]
     while losses[-1] < losses[-2] and len(losses) < MOST:
         losses.append(_loss(best, _walking(best, names, STEP ** (len(losses) - 1))))
     if losses[0] - losses[-2] < CLEAR:

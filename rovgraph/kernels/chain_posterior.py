@@ -30,25 +30,29 @@ def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
     """
     n, d, m, c = x_out.shape[0], x_out.shape[1], x_out.shape[2], y.shape[0]
     totals, known = np.zeros(m), np.zeros((2 * d + c, m))  # x_k, x_{k+1}, y, in the order of the conditionals' columns
+    here = np.zeros((d, 2 * d + c))  # read forwards: backwards, a processor waits for its memory
     for j in range(c):
         for col in range(m):
             known[2 * d + j, col] = y[j, col]
     for k in range(n - 1, -1, -1):
+        for i in range(d):
+            for j in range(2 * d + c):
+                here[i, j] = conditionals[k, i, j]
         for i in range(d - 1, -1, -1):
             if m == 1:  # a sum in a register, at a quarter of the time
                 total = x_out[k, i, 0]
                 for j in range(i + 1, 2 * d + c):
-                    total -= conditionals[k, i, j] * known[j, 0]
-                known[i, 0] = total / conditionals[k, i, i]
+                    total -= here[i, j] * known[j, 0]
+                known[i, 0] = total / here[i, i]
                 continue
             for col in range(m):
                 totals[col] = x_out[k, i, col]
             for j in range(i + 1, 2 * d + c):
-                factor = conditionals[k, i, j]
+                factor = here[i, j]
                 for col in range(m):
                     totals[col] -= factor * known[j, col]
             for col in range(m):
-                known[i, col] = totals[col] / conditionals[k, i, i]
+                known[i, col] = totals[col] / here[i, i]
         for i in range(d):
             for col in range(m):
                 x_out[k, i, col] = known[d + i, col] = known[i, col]

@@ -157,17 +157,24 @@ def eliminate_dive(
     return close_border(n, d, room, out.border)
 
 
+@view_helper
+def _squared_lengths_at(
+    k: int, dive: DiveFactors, point: States, scratch: LinearizationScratch, square_out: Vector
+) -> None:
+    """Those of keyframe k."""
+    state, which, sensors = epoch(point, k), dive.measured.which, dive.sensors
+    for m in range(dive.first[k], dive.first[k + 1]):
+        square_out[m] = 0.0
+        if sensors[which[m], KIND] != PRELINEARISED:
+            square_out[m] = squared_length(state, pick(dive.measured, m, sensors, scratch), dive.gravity, scratch)
+
+
 @kernel()
 def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> None:
     """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 where `PRELINEARISED`."""
-    first, sensors, which = dive.first, dive.sensors, dive.measured.which
     scratch = make_scratch(point.c.shape[1], np.empty(0, np.int64))
-    for k in range(len(first) - 1):
-        state = epoch(point, k)
-        for m in range(first[k], first[k + 1]):
-            square_out[m] = 0.0
-            if sensors[which[m], KIND] != PRELINEARISED:
-                square_out[m] = squared_length(state, pick(dive.measured, m, sensors, scratch), dive.gravity, scratch)
+    for k in range(len(dive.first) - 1):
+        _squared_lengths_at(k, dive, point, scratch, square_out)
 
 
 @kernel()

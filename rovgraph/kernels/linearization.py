@@ -410,6 +410,41 @@ def linearize_measurement(
     return square
 
 
+@view_helper
+def _linearize_one(
+    j: int,
+    begin: int,
+    states: States,
+    measured: MeasuredRows,
+    sensors: Matrix,
+    gravity: float,
+    weighted: bool,
+    scratch: LinearizationScratch,
+    r_out: Vector,
+    H_out: Matrix,
+) -> int:
+    """Measurement j of `linearize`, from a row on; returns the row after it."""
+    one, state = pick(measured, j, sensors, scratch), epoch(states, j if len(states.R) > 1 else 0)
+    end = begin + int(one.sensor[DIM])
+    r = r_out[begin:end]
+    if len(H_out) > 0:
+        square = linearize_measurement(state, one, gravity, scratch, r, H_out[begin:end])
+    else:
+        innovate(state, one, gravity, False, scratch)
+        square = 0.0
+        for a in range(end - begin):
+            for k in range(a + 1):
+                r[a] += scratch.W[a, k] * scratch.z[k]
+            square += r[a] * r[a]
+    if weighted:
+        root = math.sqrt(loss_weight(square, int(one.sensor[LOSS]), one.sensor[LOSS_THRESHOLD]))
+        for a in range(begin, end):
+            r_out[a] *= root
+            for i in range(H_out.shape[1]):
+                H_out[a, i] *= root
+    return end
+
+
 @kernel()
 def linearize(
     states: States,
@@ -430,27 +465,9 @@ def linearize(
     weighted : multiply them by the root of the weight of their loss
     r_out, H_out : shapes (k,), (k, n), zero before; of shape (0, n) the Jacobians are left out
     """
-    begin, scratch, derive = 0, make_scratch(states.c.shape[1], column), len(H_out) > 0
+    begin, scratch = 0, make_scratch(states.c.shape[1], column)
     for j in range(len(measured.which)):
-        one, state = pick(measured, j, sensors, scratch), epoch(states, j if len(states.R) > 1 else 0)
-        dim = int(one.sensor[DIM])
-        r = r_out[begin : begin + dim]
-        if derive:
-            square = linearize_measurement(state, one, gravity, scratch, r, H_out[begin : begin + dim])
-        else:
-            innovate(state, one, gravity, False, scratch)
-            square = 0.0
-            for a in range(dim):
-                for k in range(a + 1):
-                    r[a] += scratch.W[a, k] * scratch.z[k]
-                square += r[a] * r[a]
-        if weighted:
-            root = math.sqrt(loss_weight(square, int(one.sensor[LOSS]), one.sensor[LOSS_THRESHOLD]))
-            for a in range(begin, begin + dim):
-                r_out[a] *= root
-                for i in range(H_out.shape[1]):
-                    H_out[a, i] *= root
-        begin += dim
+        begin = _linearize_one(j, begin, states, measured, sensors, gravity, weighted, scratch, r_out, H_out)
 
 
 @kernel()
