@@ -11,12 +11,12 @@ variances. Spurious information of the DVL's arm is subtracted (`rovgraph.infere
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from rovgraph.inference.chain import Chain
 from rovgraph.inference.chain_optimum import ChainOptimum
-from rovgraph.inference.gauss_newton import Gates
 from rovgraph.inference.lever_arm_bias import ARM, spurious_information
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.widened_chain import widened
@@ -59,14 +59,24 @@ def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
     return ChainOptimum(chain, replace(best.solution, point=best.state, gates=gates))
 
 
-def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None) -> list[ScoreTest]:
-    """Each component of some constants that are held, released by itself.
+_known: WeakKeyDictionary[ChainOptimum, dict[tuple[str, ...], list[ScoreTest]]] = WeakKeyDictionary()
+
+
+def score_test(best: ChainOptimum, names: Iterable[str]) -> list[ScoreTest]:
+    """Each component of some constants that are held, released by itself; an optimum is tested once.
 
     Parameters
     ----------
     best : the optimum
     names : calibration variables; those that are estimated, or whose sensor is not in use, are passed over
     """
+    known, chosen = _known.setdefault(best, {}), tuple(names)
+    if chosen not in known:
+        known[chosen] = _released(best, chosen)
+    return known[chosen]
+
+
+def _released(best: ChainOptimum, names: tuple[str, ...]) -> list[ScoreTest]:
     used, beliefs = {*best.chain.blocks, "imu"}, dict(best.beliefs)
     held = [n for n in names if n not in best.unknowns.estimated and beliefs[n].is_shown_by(used)]
     considered = [n for n in best.unknowns.considered if beliefs[n].is_shown_by(used)]
@@ -75,7 +85,7 @@ def score_test(best: ChainOptimum, names: Iterable[str], gates: Gates | None = N
         belief = beliefs[name]
         beliefs[name] = replace(belief, estimate=True, sd=WIDE * belief.variable.sd, walk=0.0)
     released = widened(best.chain, best.state, free, beliefs)
-    root = released.eliminate(best.state, best.solution.gates if gates is None else gates, kept=1)
+    root = released.eliminate(best.state, best.solution.gates, kept=1)
     R, z = root.border[:, :-1], root.border[:, -1]
     information, score = R.T @ R, R.T @ z
     kept = [released.layout.places[name] for name in best.unknowns.estimated]

@@ -404,9 +404,11 @@ def linearize_measurement(
         square += r_out[a] * r_out[a]
     for u in range(len(scratch.used)):
         j, column = scratch.used[u], scratch.column[u]
-        for a in range(int(one.sensor[DIM])):
-            for k in range(a + 1):
-                H_out[a, column] += W[a, k] * H[k, j]
+        for k in range(int(one.sensor[DIM])):
+            by = H[k, j]
+            if by != 0.0:
+                for a in range(k, int(one.sensor[DIM])):
+                    H_out[a, column] += W[a, k] * by
     return square
 
 

@@ -310,24 +310,25 @@ class WaterLayers:
         if K > 1:
             np.add.at(here, above + 1, weight * share**2)
             np.add.at(right, above + 1, (weight * share)[:, None] * cells.velocity)
-        out, before, q, least = [], 0.0, np.zeros(3), FILLED * float(here.max(initial=0.0))
-        widened = believed * math.sqrt(1.0 + 2.0 * rho * (len(place) > 1))
-        for k in range(K):
-            pivot = here[k] - before**2
-            if pivot <= least:
+        known, before, q, least = [], 0.0, np.zeros(3), FILLED * float(here.max(initial=0.0))
+        for k, (own, next_one) in enumerate(zip(here.tolist(), below.tolist(), strict=True)):
+            if own - before**2 <= least:
                 before, q = 0.0, np.zeros(3)
                 continue
-            root = math.sqrt(pivot)
+            root = math.sqrt(own - before**2)
             q = (right[k] - before * q) / root
-            before = below[k] / root
-            total, knot = root + before, int(first) + k
-            context = np.zeros(at.LAYER_WIDTH)
-            context[at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
-            context[[at.ABOVE_AT, at.BELOW_AT]] = self._places[[knot % K, (knot + (before > 0.0)) % K]]
-            context[[at.SHARE, at.FIRST_KNOT]] = before / total, first
-            sd = np.hypot(widened / total, [0.0, 0.0, self.config.water.vertical_sd_mps])
-            out.append(np.concatenate([q / total, sd, context, [float(k)]]))
-        return np.array(out).reshape(-1, 7 + at.LAYER_WIDTH)
+            before = next_one / root
+            known.append((k, root + before, before, *q))
+        out = np.zeros((len(known), 7 + at.LAYER_WIDTH))
+        layer, total, of_next, *product = np.array(known).reshape(-1, 6).T
+        knot, context = int(first) + layer.astype(np.int64), out[:, 6:]
+        widened = believed * math.sqrt(1.0 + 2.0 * rho * (len(place) > 1))
+        out[:, :3] = (product / total).T
+        out[:, 3:6] = np.hypot(widened / total[:, None], [0.0, 0.0, self.config.water.vertical_sd_mps])
+        context[:, at.LAYER_ARM : at.LAYER_ARM + 3] = self._arm_b
+        context[:, at.ABOVE_AT], context[:, at.BELOW_AT] = self._places[[knot % K, (knot + (of_next > 0.0)) % K]]
+        context[:, at.SHARE], context[:, at.FIRST_KNOT], context[:, at.LAYER_WIDTH] = of_next / total, first, layer
+        return out
 
 
 def _level(imu: Array, time: float) -> Array:
