@@ -191,9 +191,9 @@ class Problem:
 
     def measured(self, some: "slice | Index" = slice(None)) -> MeasuredRows:
         """Measurements as kernels take them."""
-        rows, which, window = self.rows[some, : measured.ROW], self.which[some], self.window[some]
-        if self.context:
-            rows = np.hstack([rows, self.contexts(some)])
+        rows, which, window = self.rows[some], self.which[some], self.window[some]
+        if rows.shape[1] > measured.ROW + self.context:  # of sensors with more components than a kernel takes
+            rows = np.hstack([rows[:, : measured.ROW], self.contexts(some)])
         scales = self.row_scales[some] if len(self.row_scales) else self.row_scales
         contiguous = np.ascontiguousarray
         return MeasuredRows(contiguous(rows), contiguous(which), scales, contiguous(window), self.windows)
