@@ -468,6 +468,7 @@ class Files:
     ----------
     state : the checkpoint that is resumed; None without one
     received : what had been received after it; None where there is nothing
+    told : time of the newest event that stands in its file [s]; -inf without one
 
     Raises
     ------
@@ -494,6 +495,7 @@ class Files:
             until = -np.inf if self.replayed else float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.warnings)
         self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
+        self.told = _newest_event(self.folder / EVENTS) if self.resume else -np.inf
         self.track = TrackFile(self.folder / TRACK, until)
         self.keeper = Keeper(checkpoint, self.warnings)
         recorded = self.config.model_copy(update={**AS_WRITTEN, "delay_s": {}})  # which has been applied
@@ -587,6 +589,27 @@ class Files:
     def close(self) -> None:
         self.keeper.close()
         self.recorder.close()
+
+
+def _newest_event(path: Path) -> float:
+    """Time of the newest event of a file, -inf without one [s]; a last line that is torn is cut off.
+
+    Raises
+    ------
+    InputError : the file cannot be read or written
+    """
+    with _one_line(path):
+        if not path.exists():
+            return -np.inf
+        content = path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            os.truncate(path, len(whole))
+    times = []
+    for line in whole.splitlines():
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # blank after a power cut; before there was a time
+            times.append(float(json.loads(line)["time"]))
+    return max(times, default=-np.inf)
 
 
 def _last_rows(path: Path, origin: Origin | None) -> pd.DataFrame:
