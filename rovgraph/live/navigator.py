@@ -168,7 +168,7 @@ class Navigator:
             self._heard = {**self._heard, message.source: known | new}
 
     def replay(self, log: Log, told: float = -np.inf) -> None:
-        """Take what had been received before, on the estimator's clock; events up to ``told`` [s] are not told again."""
+        """Take what had been received before, on the estimator's clock; events up to ``told`` [s] are told already."""
         if self.origin is None:
             self._intake.origin = log.origin
         known = self.engine.snapshots[0].time if self.engine is not None else -np.inf
