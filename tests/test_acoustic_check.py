@@ -134,6 +134,8 @@ def own_depth(dive: Dive) -> Table:
 FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
     "late": (late(1.5), {}, "lag", "1.5 s late"),
     "early": (late(-0.7), {}, "lag", "0.7 s early"),
+    "a delay that is none": (lambda d: d.streams["usbl"], {"delay_s": {"usbl": 1.0}}, "lag", "1.0 s early"),
+    "a longer one": (lambda d: d.streams["usbl"], {"delay_s": {"usbl": 2.0}}, "lag", "2.0 s early"),
     "yaw": (turned(30.0), {}, "turned", "head's yaw or the ship's heading is off"),
     "astern": (turned(180.0), {}, "turned", "head's yaw or the ship's heading is off"),
     "applied twice": (turned(0.0), {"usbl": {"mount_rpy_deg": [0, 0, 30]}}, "turned", "applied twice"),

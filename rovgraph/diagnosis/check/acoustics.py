@@ -284,8 +284,8 @@ class _Beside:
         return found
 
     def _lag(self, axes: "_Axes") -> "_Lag | None":
-        reach = ACOUSTIC_TRACK.reach_s
-        fits = self._fits([0.0, *np.arange(EARLIEST_S, reach + STEP_S / 2, STEP_S).tolist()], axes)
+        reach, earliest = ACOUSTIC_TRACK.reach_s, EARLIEST_S - max(self.config.delay_s.get("usbl", 0.0), 0.0)
+        fits = self._fits([0.0, *np.arange(earliest, reach + STEP_S / 2, STEP_S).tolist()], axes)
         if not fits:
             return None
         best = min(fits, key=lambda lag: fits[lag].variance)
@@ -302,7 +302,7 @@ class _Beside:
         count = max(inflation(fit.left), inflation(fits[0.0].left))  # what wanders slowly looks like a lag
         before, after = (cost(side) for side in sides.values())
         bend = max((before - 2.0 * cost(fit) + after) / FINE_S**2, 1e-12)
-        sd = math.sqrt(2.0 * count / bend) if EARLIEST_S < best < reach else np.inf
+        sd = math.sqrt(2.0 * count / bend) if earliest < best < reach else np.inf
         evidence = (cost(fits[0.0]) - cost(fit)) / count
         return _Lag(best + 0.5 * (before - after) / FINE_S / bend, sd, evidence, fit)
 
