@@ -9,10 +9,11 @@ import numpy as np
 
 from rovgraph.diagnosis.acoustics import find_head_errors
 from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, verdict_of
-from rovgraph.diagnosis.beacons import SAME_M, BeaconPlaces, MirroredBeacon, find_beacons
+from rovgraph.diagnosis.beacons import BeaconPlaces, MirroredBeacon, find_beacons
 from rovgraph.diagnosis.check import Finding
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.diagnosis.statistics import find_advice, find_alarms, statistics
+from rovgraph.diagnosis.trilateration import SAME_M
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.geometry import Array
 from rovgraph.inference.attitude_gaps import AttitudeGap, without_attitude_gaps

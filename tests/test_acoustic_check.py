@@ -14,6 +14,7 @@ import pytest
 from ruamel.yaml import YAML
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from dives import below_a_ship, without
 from fault_campaign.acoustic import Acoustic, Ship, System, usbl
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import log_table, sample
@@ -133,6 +134,8 @@ def own_depth(dive: Dive) -> Table:
 FAULTS: dict[str, tuple[Callable[[Dive], Table], dict[str, Any], str, str]] = {
     "late": (late(1.5), {}, "lag", "1.5 s late"),
     "early": (late(-0.7), {}, "lag", "0.7 s early"),
+    "a delay that is none": (lambda d: d.streams["usbl"], {"delay_s": {"usbl": 1.0}}, "lag", "1.0 s early"),
+    "a longer one": (lambda d: d.streams["usbl"], {"delay_s": {"usbl": 2.0}}, "lag", "2.0 s early"),
     "yaw": (turned(30.0), {}, "turned", "head's yaw or the ship's heading is off"),
     "astern": (turned(180.0), {}, "turned", "head's yaw or the ship's heading is off"),
     "applied twice": (turned(0.0), {"usbl": {"mount_rpy_deg": [0, 0, 30]}}, "turned", "applied twice"),
@@ -198,6 +201,43 @@ def test_ranges_in_centimetres_are_named_by_the_depth(dive):
     mended = followed(dive.configuration, said[0].text)
     assert mended["units"]["usbl_range"] == "cm"
     assert found(dive.read(mended, usbl=replies), mended, (acoustics.depths,)) == []
+
+
+IN_MS = 2e3 / 1500.0  # travel time there and back of a metre [ms]
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("ft", 0.3048), ("cm", 0.01)])
+def test_ranges_to_beacons_in_another_unit_are_named_by_the_dvls_way(unit, metre):
+    log, config = below_a_ship()
+    frame = without(log, "usbl").to_frame()
+    frame["range"] /= metre
+    said = [f for f in acoustics.lengths(Log.from_frame(frame, config), config) if f.level != "ok"]
+    assert [f.kind for f in said] == ["unit"] and f"state units: {{range: {unit}}}" in said[0].text
+    mended = config.changed(units={"range": unit})
+    assert [*acoustics.lengths(Log.from_frame(frame, mended), mended)] == []
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("ms", IN_MS), ("us", 1e3 * IN_MS)])
+def test_travel_times_may_be_stated_in_another_unit(unit, metre):
+    log, config = below_a_ship()
+    frame = without(log, "usbl").to_frame()
+    lengths = frame.pop("range")
+    frame["travel_time"] = metre * lengths
+    named = [f.text for f in acoustics_own(Log.from_frame(frame, config), config) if f.level == "error"]
+    assert len(named) == 1 and f"state units: {{travel_time: {unit}}}" in named[0]
+    seconds = Log.from_frame(frame, config.changed(units={"travel_time": unit}))["range"]["travel_time"]
+    np.testing.assert_allclose(seconds, lengths[lengths.notna()] / 750.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0 / 0.3048])
+def test_ranges_of_a_head_in_feet_are_named_without_a_depth_sensor(dive, factor):
+    replies = altered(dive.streams["usbl"], usbl_range=lambda t: factor * t["usbl_range"])
+    checks, absent = (acoustics.lengths,), ("imu", "depth")
+    said = found(dive.read(dive.configuration, absent, usbl=replies), dive.configuration, checks)
+    assert [f.kind for f in said] == ["unit"] * (factor > 1.0)
+    for finding in said:
+        mended = followed(dive.configuration, finding.text)
+        assert found(dive.read(mended, absent, usbl=replies), mended, checks) == []
 
 
 def acoustics_own(log: Log, config: Config) -> Iterator[Finding]:
@@ -385,6 +425,11 @@ def degrees(column: str) -> Callable[[Table], Any]:
     ("sensor", "columns", "words"),
     [
         ("usbl", {"usbl_range": lambda t: 1000.0 * t["usbl_range"]}, "state units: {usbl_range: mm}"),
+        (
+            "usbl",
+            {"usbl_travel_time": lambda t: IN_MS * t["usbl_range"], "usbl_range": lambda t: np.nan},
+            "state units: {usbl_travel_time: ms}",
+        ),
         ("usbl", {"usbl_beacon": several}, "2 transponders answer (3, 4); state which is the vehicle's"),
         ("usbl", {"usbl_bearing": degrees("usbl_bearing")}, "state units: {usbl_bearing: deg}"),
         ("usbl", {"usbl_elevation": degrees("usbl_elevation")}, "state units: {usbl_elevation: deg}"),

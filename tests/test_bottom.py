@@ -20,7 +20,10 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs.json_lines import as_dict
 from rovgraph.log import STREAMS, Stream
 from rovgraph.model.config import Config, parse_config
+from rovgraph.model.grids import PLACE_DECIMALS
+from rovgraph.model.origin import north_east
 from rovgraph.report.export import ExportOptions, Track, write_track
+from rovgraph.report.results import Remarks, write_results
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry
 
 SLOPE, DEPTH = np.array([0.2, -0.1]), 14.0
@@ -221,8 +224,24 @@ def test_results_hold_altitude_bottom_and_soundings(smoothed):
     assert "altitude" in pd.read_csv(folder / "trajectory_filtered.csv", nrows=1)
     assert "altitude_sd" not in pd.read_csv(folder / "trajectory_dead_reckoning.csv", nrows=1)
     soundings = pd.read_csv(folder / "soundings.csv")
-    pd.testing.assert_frame_equal(soundings, result.bottom.soundings, rtol=1e-5, atol=1e-4)
+    own = result.bottom.soundings
+    pd.testing.assert_frame_equal(soundings[own.columns], own, rtol=1e-5, atol=1e-4)
+    there = north_east(soundings["lat"], soundings["lon"], ORIGIN)
+    np.testing.assert_allclose(np.column_stack(there), own[["north", "east"]], atol=1e-3)
     assert soundings.groupby("beam").size()[2] < 0.6 * soundings.groupby("beam").size()[1]
+
+
+def test_soundings_are_in_the_grid_that_is_stated(smoothed, tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    _, log, config, result, _ = smoothed
+    write_results(tmp_path, [result.smoothed], log, changed(config, environment={"grid": "EPSG:32631"}), {}, Remarks())
+    table = pd.read_csv(tmp_path / "soundings.csv")
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32631", always_xy=True).transform(table["lon"], table["lat"])
+    np.testing.assert_allclose(table[["easting", "northing"]], np.column_stack([x, y]), atol=2e-4)
+    track = pd.read_csv(tmp_path / "trajectory_smoothed.csv", nrows=1)
+    assert [name for name in table if name not in result.bottom.soundings] == [
+        name for name in track if name in PLACE_DECIMALS
+    ]
 
 
 def test_the_page_shows_every_beam_and_the_bottom(smoothed):

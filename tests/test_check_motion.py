@@ -424,3 +424,20 @@ def test_depth_and_dvl_at_both_ends_of_a_vehicle_that_pitches_agree() -> None:
     doubts, taken_for_one = ([f.text for f in vertical(log, of) if f.level != "ok"] for of in (apart, one_place))
     assert not doubts
     assert any("the clocks disagree" in text for text in taken_for_one)
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_a_depth_in_bar_is_named_where_the_dvl_is_away_from_it(with_imu) -> None:
+    """Tilts move a depth in metres by the arm; without an IMU they are those that the vehicle states."""
+    config = falcon()
+    case = simulated(config, 200.0, seed=1)
+    log = case.log
+    if not with_imu:
+        time = np.arange(log.start, log["imu"].time[-1], 0.2)
+        rpy = true_at(case, time).rpy
+        tilt = Stream("vehicle_tilt", STREAMS["vehicle_tilt"], time, rpy[:, :2], np.arange(len(time)))
+        log = without(replace(log, streams={**log.streams, "vehicle_tilt": tilt}), "imu", "mag")
+    assert not [f.text for f in vertical(log, config) if f.level != "ok"]
+    in_bar = altered(log, "depth", log["depth"].data / 9.945)
+    (named,) = (f for f in vertical(in_bar, config) if f.level != "ok")
+    assert (named.sensor, named.kind) == ("depth", "unit") and "state units: {pressure: bar}" in named.text

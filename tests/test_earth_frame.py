@@ -12,6 +12,7 @@ import pytest
 import rovgraph
 from rovgraph import InputError
 from rovgraph.geometry import EARTH_RATE, Array, exp_rotation, matrix_from_rpy
+from rovgraph.inference.initialise import initialise
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.earth import normal_gravity, radii
 from rovgraph.kernels.motion import transitions
@@ -304,9 +305,13 @@ def test_a_track_a_degree_from_its_origin_is_that_of_the_body_whatever_the_arms(
     stated = config(origin_lat_deg=69.0, origin_lon_deg=10.0) | {"fix": {"lever_arm_m": antenna}}
     stated["imu"]["lever_arm_m"] = stated["dvl"]["lever_arm_m"] = at_imu
     settings = rovgraph.parse_config(json.dumps(stated))
-    result = rovgraph.smooth(rovgraph.read_log(tmp_path / "log.csv", settings), settings)
+    read = rovgraph.read_log(tmp_path / "log.csv", settings)
+    result = rovgraph.smooth(read, settings)
     at = np.interp(result.smoothed.trajectory.time, log["time"], np.arange(len(log))).round().astype(int)
     assert apart(result, truth[at]) < 0.01
+    start = initialise(read, settings).config.start  # from the first fix, whose arm is in metres
+    place = north_east(*truth[0][:2], EarthOrigin(69.0, 10.0))
+    np.testing.assert_allclose([start.north_m, start.east_m], np.ravel(place), atol=0.01)
 
 
 def test_a_fix_with_the_last_ping_counts(tmp_path):

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from dives import campaign_log
 
-from rovgraph.diagnosis.beacons import RangesAlongTrack, _sd_to_begin, ambiguous, around, sides
+from rovgraph.diagnosis.beacons import _sd_to_begin, ambiguous
+from rovgraph.diagnosis.trilateration import RangesAlongTrack, around, sides
 from rovgraph.inference.initialise import initialise
 from rovgraph.live.beacons import UnplacedBeacons
 from rovgraph.live.clocks import Clocks

@@ -362,6 +362,7 @@ def recorded(folder: Path, case: Simulated, until: float) -> None:
     """A run that was ended at some time."""
     warnings = Warnings()
     nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
+    folder.mkdir(exist_ok=True)
     files = Files(folder, case.config, warnings)
     Session(nav, [], warnings, 2.0, files).run(message(m) for m in case.log.measurements() if m.time < until)
     files.close()
@@ -388,6 +389,33 @@ def test_resuming_what_received_nothing_begins_again_and_writes_what_is_json(cas
     files.close()
     first = json.loads((tmp_path / "events.jsonl").read_text().splitlines()[0], parse_constant=lambda name: 1 / 0)
     assert first["time"] is None and "starts again" in first["text"]
+
+
+@pytest.mark.parametrize("replayed_s", [0.0, 1e3])
+def test_events_that_were_written_before_a_crash_are_not_written_again(case, tmp_path, monkeypatch, replayed_s):
+    """From the checkpoint, whose last seconds are read again, and from a short recording that all is."""
+    monkeypatch.setattr("rovgraph.live.files.REPLAYED_S", replayed_s)
+    monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
+    begin = case.log.start
+    log = [m for m in case.log.measurements() if m.sensor != "dvl" or not 27.0 < m.time - begin < 31.0]
+    without_break = replace(case, log=SimpleNamespace(measurements=lambda: log))
+    recorded(tmp_path / "whole", without_break, begin + 40.0)
+    recorded(tmp_path / "torn", without_break, begin + 35.0)
+    events = tmp_path / "torn" / "events.jsonl"
+    with events.open("a") as file:
+        file.write('{"time": 34.9, "sour')
+    nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
+    files = Files(tmp_path / "torn", case.config, Warnings(), resume=True)
+    session = Session(nav, [], Warnings(), 2.0, files)
+    session.resume()
+    session.run(message(m) for m in log if begin + 35.0 <= m.time < begin + 40.0)
+    files.close()
+    whole, torn = (
+        [json.loads(line) for line in (tmp_path / name / "events.jsonl").read_text().splitlines()]
+        for name in ("whole", "torn")
+    )
+    assert {"silent", "back"} <= {event["kind"] for event in whole}
+    assert [event for event in torn if event["kind"] != "resumed"] == whole
 
 
 def test_a_summary_that_cannot_be_written_is_one_line_and_leaves_no_rest(capsys, dive, tmp_path, monkeypatch):

@@ -121,6 +121,23 @@ def test_units_and_the_unit_that_numbers_are_in(unit: str, pascal: float) -> Non
         log_of(pressure / pascal, NORTH)
 
 
+@pytest.mark.parametrize(("unit", "pascal"), [("kPa", 1e3), ("bar", 1e5), ("hPa", 1e2)])
+def test_the_unit_is_named_live_and_where_the_surface_is_stated(unit: str, pascal: float) -> None:
+    _, pressure = dive()
+    stated = NORTH.changed(depth={"surface_hpa": 1003.0})
+    with pytest.raises(rg.InputError, match=rf"no air has so little; state units: {{pressure: {unit}}}"):
+        log_of(pressure / pascal, stated)
+    for config in (NORTH, stated):
+        intake = Intake(config, Counter())
+        found = [
+            intake.measurement(t, Reading("pressure", np.array([p / pascal])))
+            for t, p in zip(TIME, pressure, strict=True)
+        ]
+        assert not any(found)
+        ((sensor, said),) = intake.news
+        assert sensor == "pressure" and f"left out: state units: {{pressure: {unit}}}" in said
+
+
 @pytest.mark.parametrize(
     ("number", "said"),
     [

@@ -274,7 +274,8 @@ def test_every_unit_has_the_factor_that_pint_has():
     """Milligauss was free to be wrong."""
     registry = pint.UnitRegistry()
     inside = {
-        "time": "second", "acceleration": "meter / second ** 2", "rate": "radian / second", "field": "microtesla",
+        "time": "second", "duration": "second",
+        "acceleration": "meter / second ** 2", "rate": "radian / second", "field": "microtesla",
         "angle": "radian", "speed": "meter / second", "length": "meter", "latitude": "degree", "pressure": "pascal",
         "area": "meter ** 2",
     }  # fmt: skip

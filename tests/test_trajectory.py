@@ -67,6 +67,22 @@ def test_a_growing_track_keeps_the_columns_that_it_began_with(trajectory, tmp_pa
     assert (tmp_path / "early.csv").read_text() == (tmp_path / "whole.csv").read_text()
 
 
+def test_a_growing_track_has_the_grid_of_results(trajectory, tmp_path):
+    pytest.importorskip("pyproj")
+    origin, grid = (58.3, 14.5), "EPSG:32633"
+    trajectory.write_csv(tmp_path / "whole.csv", origin=origin, grid=grid)
+    path = tmp_path / "growing.csv"
+    TrackFile(path, grid=grid).add(trajectory.take(np.arange(20)), origin)
+    TrackFile(path, float(trajectory.time[20]), grid).add(trajectory.take(np.arange(20, N)), origin)
+    assert "grid_scale" in pd.read_csv(path) and path.read_text() == (tmp_path / "whole.csv").read_text()
+    with pytest.raises(InputError, match=r"begun in a map grid; state the same environment\.grid"):
+        TrackFile(path, float(trajectory.time[20]))
+    late = tmp_path / "late.csv"
+    TrackFile(late).add(trajectory.take(np.arange(20)), origin)  # as an older release began it
+    TrackFile(late, float(trajectory.time[20]), grid).add(trajectory.take(np.arange(20, N)), origin)
+    assert len({line.count(",") for line in late.read_text().splitlines()}) == 1
+
+
 def test_a_growing_file_keeps_its_columns_when_its_clock_becomes_unix_time(tmp_path):
     """Also where it was begun by a release that wrote no ``unix_time``."""
     early, late = (

@@ -23,7 +23,7 @@ from rovgraph.problem.problem import Problem
 from rovgraph.sensors import AcousticExchange
 
 LATENCY = "usbl_time_offset"
-EARLIEST_S, LATEST_S, STEP_S = -1.0, 5.0, 0.1  # lags that are tried; systems are up to 3 s late
+EARLIEST_S, LATEST_S, STEP_S = -1.0, 5.0, 0.1  # lags that are tried; systems are up to 3 s late, by their own stamps
 ENOUGH = 20  # replies
 MOST = 1500  # of them that are compared, evenly
 CLEARER = 30.0  # gain of the robust cost that a lag must bring
@@ -51,15 +51,17 @@ def find_head_errors(log: Log, problem: Problem, initial: InitialConditions) -> 
     if len(replies) > MOST:
         replies = replies.take(np.unique(np.linspace(0, len(replies) - 1, MOST).astype(int)))
     search = _LagSearch(log, replies, problem.time, states, initial)
-    late = None if initial.beliefs[LATENCY].estimate else _find_latency(search, initial.beliefs[LATENCY])
+    taken_off = max(initial.config.delay_s.get("usbl", 0.0), 0.0)  # which may be wrong
+    latency = initial.beliefs[LATENCY]
+    late = None if latency.estimate else _find_latency(search, latency, EARLIEST_S - taken_off)
     lag = float((initial.beliefs[LATENCY] if late is None else late.beliefs.calibration[LATENCY]).mean[0])
     drift = _find_drift(search, lag, initial.beliefs[USBL_MOUNT[2]], float(np.ptp(problem.time)))
     return [found for found in (late, drift) if found is not None]
 
 
-def _find_latency(search: "_LagSearch", belief: Belief) -> UnstatedNoise | None:
+def _find_latency(search: "_LagSearch", belief: Belief, earliest: float) -> UnstatedNoise | None:
     stated = float(belief.mean[0])
-    lags = stated + np.arange(EARLIEST_S, LATEST_S + STEP_S / 2, STEP_S)
+    lags = stated + np.arange(earliest, LATEST_S + STEP_S / 2, STEP_S)
     cost = np.array([search.cost(lag) for lag in lags])
     if not np.isfinite(cost).any():
         return None
@@ -77,7 +79,8 @@ def _find_latency(search: "_LagSearch", belief: Belief) -> UnstatedNoise | None:
         "usbl",
         f"calibration.{LATENCY}",
         {"estimate": True, "mean": round(lag, 2), "sd": round(sd, 2)},
-        f"its stamps are {lag:.2f} s late beside the vehicle's own motion and the ship's",
+        f"its stamps are {abs(lag):.2f} s {'late' if lag > 0.0 else 'early'} beside the vehicle's own motion and the "
+        f"ship's{' with delay_s.usbl taken off' if search.initial.config.delay_s.get('usbl') else ''}",
         "it is estimated from there",
         Beliefs({LATENCY: replace(belief, mean=np.array([lag]), sd=sd, estimate=True)}),
     )

@@ -10,7 +10,7 @@ from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.geometry import EARTH_RATE, Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.estimate import CalibrationEstimate
-from rovgraph.inference.lever_arm_bias import ARM
+from rovgraph.inference.rate_noise import ARM
 from rovgraph.inference.score_test import ScoreTest, as_chain, score_test
 from rovgraph.log.units import behind, shown
 from rovgraph.model.calibration import TABLE, USBL_MOUNT

@@ -12,7 +12,7 @@ The factor of white noise comes from differences of successive residuals, which 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
 
 `estimate_lever_arm` finds the DVL's lever arm from the vehicle's own rates. Where the gyro's noise would bias the arm
-if it were estimated, the arm is considered and stays at its mean, however wrong (`rovgraph.inference.lever_arm_bias`).
+if it were estimated, the arm is considered and stays at its mean, however wrong (`rovgraph.inference.rate_noise`).
 The score test without that noise gives the right one.
 """
 
@@ -30,7 +30,7 @@ from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival, find_correlated_noise
 from rovgraph.inference.gauss_newton import rejects
-from rovgraph.inference.lever_arm_bias import ARM
+from rovgraph.inference.rate_noise import ARM
 from rovgraph.inference.score_test import score_test
 from rovgraph.inference.water_walk import knots_walking_faster
 from rovgraph.inference.widened_chain import lasting_belief

@@ -46,7 +46,7 @@ from rovgraph.inference.chain import Chain
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.faulty_intervals import resume
 from rovgraph.inference.gauss_newton import GaussNewtonResult, rejects
-from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm
+from rovgraph.inference.rate_noise import ARM, rate_noise_moves_arm
 from rovgraph.inference.widened_chain import begin_at, with_lasting
 from rovgraph.model.calibration import TABLE
 from rovgraph.model.gauss_markov import stationary_sd, stationary_walk
@@ -487,7 +487,7 @@ def _fit(now: _Baseline, candidate: GaussMarkovError) -> tuple[GaussMarkovError,
 def _noise_moves_arm(now: _Baseline) -> bool:
     """Whether the gyro's noise would move the DVL's arm, were it estimated."""
     best = ChainOptimum(now.chain, now.solution)
-    return noise_moves_arm(best, best.relative_sd()[ARM] * best.beliefs[ARM].sd)
+    return rate_noise_moves_arm(best, best.relative_sd()[ARM] * best.beliefs[ARM].sd)
 
 
 def _as_constant(

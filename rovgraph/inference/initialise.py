@@ -256,7 +256,8 @@ def first_position(dive: Resolution, R_nb: Array) -> tuple[Array, Array]:
             opening = fixes.time[0]  # however late they begin: the frame is theirs
             fixes = fixes.between(opening, opening + WITHIN_S)
             here, own_sd = _first_fix(fixes, config.fix.sd_m)
-            p_n[:2] = here - rotate(R_nb, np.asarray(arm))[:2]
+            metres = scale_at(config.environment.earth_latitude, np.array([[*here, 0.0]]))[0]
+            p_n[:2] = here - (metres * rotate(R_nb, np.asarray(arm)))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
             dive.assume(f"start position from the first {what}, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
             if start.down_m is None and "depth" not in log and "down" in fixes.columns:

@@ -8,7 +8,7 @@ linearisation takes the trembling for accelerations, and these seem to show the 
 information, even along a straight line. It is found by adding the same noise again (simulation extrapolation; Cook and
 Stefanski 1994): noise of the states is drawn from the graph's own posterior, added to the estimate with both signs, and
 the information gained by that is subtracted once. The effect of the gyro's noise through the DVL's lever arm is
-subtracted by its equation (`rovgraph.inference.lever_arm_bias`).
+subtracted by its equation (`rovgraph.inference.rate_noise`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, spurious_information
 from rovgraph.inference.optimum import NEWEST, Optimum, estimated_parts, joint_prior_sd
+from rovgraph.inference.rate_noise import ARM, rate_noise_moves_arm, score_of_rate_noise
 from rovgraph.problem.calibration_roles import CalibrationRoles
 
 # sd after the dive over sd before. Below 0.3 more than nine tenths of the variance are gone and
@@ -83,7 +83,7 @@ def _by_rate_noise(best: Optimum, keyframes: Sequence[int], sd: Array) -> Array:
     if best.unknowns.walks.get(ARM) == 0.0:
         arm = np.r_[estimated_parts(best)[ARM]]
         until = (np.array(keyframes) + 1.0) / len(best.problem)
-        out[:, arm, arm] = until[:, None] * spurious_information(best).information * sd[:, arm] ** 2
+        out[:, arm, arm] = until[:, None] * score_of_rate_noise(best).information * sd[:, arm] ** 2
     return out
 
 
@@ -104,7 +104,7 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
     """
     ratio = {name: sd / prior[name] for name, sd in _sds(covariance, prior).items()}
     if best.unknowns.walks.get(ARM) == 0.0:
-        ratio[ARM] = np.minimum(spurious_information(best).sd(ratio[ARM] * prior[ARM]) / prior[ARM], 1.0)
+        ratio[ARM] = np.minimum(score_of_rate_noise(best).sd(ratio[ARM] * prior[ARM]) / prior[ARM], 1.0)
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
@@ -119,7 +119,7 @@ def shown(best: Optimum) -> list[str]:
     if not best.unknowns.considered:
         return []
     relative = best.relative_sd()
-    if ARM in relative and noise_moves_arm(best, relative[ARM] * best.beliefs[ARM].sd):
+    if ARM in relative and rate_noise_moves_arm(best, relative[ARM] * best.beliefs[ARM].sd):
         del relative[ARM]
     return [name for name, ratio in relative.items() if (ratio < shown_below(best, name)).all()]
 

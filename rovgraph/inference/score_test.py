@@ -6,7 +6,7 @@ together with what is estimated, in one Gauss-Newton step from the optimum: the 
 of many sds means that the constant has another value, which the step gives. Each is released by itself: two that affect
 the same measurements would hide each other. What is considered may be off by its prior's sd, which moves the step: its
 variance becomes P + P G D G' P, with G the information between what is released and what is considered, D the priors'
-variances. Spurious information of the DVL's arm is subtracted (`rovgraph.inference.lever_arm_bias`).
+variances. The rate's noise is taken off the steps of the DVL's arm and scale (`rovgraph.inference.rate_noise`).
 """
 
 from collections.abc import Iterable
@@ -17,8 +17,8 @@ import numpy as np
 
 from rovgraph.inference.chain import Chain
 from rovgraph.inference.chain_optimum import ChainOptimum
-from rovgraph.inference.lever_arm_bias import ARM, spurious_information
 from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.rate_noise import ARM, SCALE, RateNoiseScore, score_of_rate_noise
 from rovgraph.inference.widened_chain import widened
 from rovgraph.model.state import PLACE
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -90,6 +90,7 @@ def _released(best: ChainOptimum, names: tuple[str, ...]) -> list[ScoreTest]:
     information, score = R.T @ R, R.T @ z
     kept = [released.layout.places[name] for name in best.unknowns.estimated]
     always = np.concatenate([np.empty(0, np.int64), *(np.r_[part] for border, part in kept if border)])
+    by_noise = score_of_rate_noise(best)
     prior = {c: best.beliefs[name].sd for name in considered for c in np.r_[released.layout.places[name][1]].tolist()}
     out = []
     for name in held:
@@ -99,17 +100,17 @@ def _released(best: ChainOptimum, names: tuple[str, ...]) -> list[ScoreTest]:
             others = [c for c in prior if c != component]
             by_others = P[-1] @ information[np.ix_(chosen, others)] * [prior[c] for c in others]
             sd = float(np.sqrt(P[-1, -1] + np.sum(by_others**2)))
-            out.append(ScoreTest(name, label, float(P[-1] @ score[chosen]), sd))
-    return _without_rate_noise(best, out)
+            step = float(P[-1] @ score[chosen] + P[-1, -1] * (by_noise.scale_score if name == SCALE else 0.0))
+            out.append(ScoreTest(name, label, step, sd))
+    return _arm_without_rate_noise(by_noise, out)
 
 
-def _without_rate_noise(best: ChainOptimum, released: list[ScoreTest]) -> list[ScoreTest]:
+def _arm_without_rate_noise(by_noise: RateNoiseScore, released: list[ScoreTest]) -> list[ScoreTest]:
     """The DVL's arm without spurious information; left out where little else is known of it."""
     arm = [one for one in released if one.name == ARM]
     if not arm:
         return released
     step, sd = np.array([(one.step, one.sd) for one in arm]).T
-    spurious = spurious_information(best)
-    steps, sds = spurious.step(step, sd), spurious.sd(sd)
+    steps, sds = by_noise.step(step, sd), by_noise.sd(sd)
     of_arm = [replace(one, step=float(a), sd=float(b)) for one, a, b in zip(arm, steps, sds, strict=True) if b < np.inf]
     return [one for one in released if one.name != ARM] + of_arm

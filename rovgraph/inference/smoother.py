@@ -26,10 +26,10 @@ from rovgraph.inference.estimate import (
 )
 from rovgraph.inference.faulty_intervals import CLEAR, Searches
 from rovgraph.inference.gauss_newton import rejects
-from rovgraph.inference.lever_arm_bias import ARM, noise_moves_arm, without_noise_of_rates
 from rovgraph.inference.observability import shown, shown_below, without_what_noise_moves
 from rovgraph.inference.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.inference.posterior import Posterior
+from rovgraph.inference.rate_noise import ARM, rate_noise_moves_arm, without_rate_noise
 from rovgraph.inference.resolve import unseen
 from rovgraph.log import Log
 from rovgraph.model.calibration import WATER_LAYER
@@ -73,9 +73,9 @@ def optimum(
     if isinstance(best, ChainOptimum) and best.unknowns.considered and _contradicted(best):
         free = smooth_chain(problem, initial, states, calibration, freed=True)
         if _explains(free, best):
-            return without_noise_of_rates(_with_what_is_shown(free, best.unknowns.considered, hidden))
+            return without_rate_noise(_with_what_is_shown(free, best.unknowns.considered, hidden))
     seen = [name for name in shown(best) if name not in hidden]
-    return without_noise_of_rates(best.estimating(seen) if seen else best)
+    return without_rate_noise(best.estimating(seen) if seen else best)
 
 
 def _contradicted(best: ChainOptimum) -> bool:
@@ -103,7 +103,7 @@ def _with_what_is_shown(free: ChainOptimum, considered: Sequence[str], hidden: C
     """
     P = free.covariances()
     sd = {name: np.sqrt(np.diag(P[name][-1])) for name in considered}
-    moved = [name for name in considered if name in hidden or (name == ARM and noise_moves_arm(free, sd[ARM]))]
+    moved = [name for name in considered if name in hidden or (name == ARM and rate_noise_moves_arm(free, sd[ARM]))]
     rest = [
         name
         for name in considered

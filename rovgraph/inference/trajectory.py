@@ -31,7 +31,7 @@ from rovgraph.geometry import (
 )
 from rovgraph.log import tables
 from rovgraph.log.csv_writer import write_csv
-from rovgraph.model.grids import grid_columns
+from rovgraph.model.grids import PLACE_DECIMALS, place_columns
 from rovgraph.model.origin import Origin, lat_lon
 
 if TYPE_CHECKING:
@@ -279,14 +279,9 @@ class Trajectory:
         if unix or (unix is None and dated):
             known["unix_time"] = known["time"] if dated else np.full(len(self), np.nan)
             decimals |= {"unix_time": 4} if dated else {}
-        if origin is not None:
-            known["lat"], known["lon"] = self.geodetic(origin)
-            decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
-            if grid is not None:
-                known |= grid_columns(grid, known["lat"], known["lon"])
-                decimals |= {"easting": 4, "northing": 4, "grid_north": 5, "grid_scale": 8}
+        known |= place_columns(self.p_n[:, 0], self.p_n[:, 1], origin, grid)
         known |= {name: own for name, own in (also or {}).items() if not np.isnan(own).all()}
-        write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
+        write_csv(known, as_path(path, "path"), append=more, decimals=decimals | PLACE_DECIMALS)
 
     def write_tum(self, path: Path | str) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line states them (its name should: `TUM`)."""

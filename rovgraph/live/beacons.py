@@ -14,17 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.diagnosis.beacons import (
-    FEWEST,
-    RangesAlongTrack,
-    Side,
-    ambiguous,
-    around,
-    below,
-    depth_of_bottom,
-    either,
-    sides,
-)
+from rovgraph.diagnosis.beacons import FEWEST, ambiguous, below, depth_of_bottom, either
+from rovgraph.diagnosis.trilateration import RangesAlongTrack, Side, around, sides
 from rovgraph.geometry import Array
 from rovgraph.inference.filter import ErrorLayout
 from rovgraph.inference.filter_step import Gaussian

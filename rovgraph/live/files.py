@@ -391,13 +391,14 @@ class TrackFile:
     ----------
     path : new, or to continue
     until : keep rows of an older file up to this time [s]; the rest comes again
+    grid : of `Trajectory.write_csv`
 
     Raises
     ------
-    InputError : the file cannot be written
+    InputError : the file cannot be written, or was begun in a grid and there is none
     """
 
-    def __init__(self, path: Path, until: float = -np.inf) -> None:
+    def __init__(self, path: Path, until: float = -np.inf, grid: str | None = None) -> None:
         self.path = path
         kept: list[str] = []
         with _one_line(path):
@@ -409,8 +410,11 @@ class TrackFile:
             partial.write_text("".join(kept), encoding="utf-8")
             partial.replace(path)
         self._begun = bool(kept)
-        self._on_earth = bool(kept) and kept[0].rstrip().endswith(",lat,lon")
-        self._unix = bool(kept) and ",unix_time" in kept[0]
+        columns = kept[0].rstrip().split(",") if kept else []
+        self._on_earth, self._unix = "lat" in columns, "unix_time" in columns
+        self._grid = grid if not kept or "easting" in columns else None
+        if "easting" in columns and grid is None:
+            raise InputError(f"{path}: was begun in a map grid; state the same environment.grid to go on with it")
 
     def add(self, trajectory: Trajectory, origin: Origin | None = None) -> None:
         """Add epochs, later than those before: all of them, or where the disk is full none.
@@ -418,14 +422,15 @@ class TrackFile:
         Parameters
         ----------
         trajectory : the epochs
-        origin : of `Trajectory.write_csv`; a file that was begun without one goes on without
+        origin : of `Trajectory.write_csv`; a file that was begun without one goes on without it and the grid
         """
         if not self._begun:
             self._on_earth, self._unix = origin is not None, is_unix(trajectory.time)
         with _one_line(self.path):
             size = self.path.stat().st_size
             try:
-                trajectory.write_csv(self.path, self._begun, origin if self._on_earth else None, self._unix)
+                where = origin if self._on_earth else None
+                trajectory.write_csv(self.path, self._begun, where, self._unix, grid=self._grid)
             except OSError:
                 os.truncate(self.path, size)
                 raise
@@ -468,6 +473,7 @@ class Files:
     ----------
     state : the checkpoint that is resumed; None without one
     received : what had been received after it; None where there is nothing
+    told : time of the newest event that stands in its file [s]; -inf without one
 
     Raises
     ------
@@ -494,7 +500,8 @@ class Files:
             until = -np.inf if self.replayed else float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.warnings)
         self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
-        self.track = TrackFile(self.folder / TRACK, until)
+        self.told = _newest_event(self.folder / EVENTS) if self.resume else -np.inf
+        self.track = TrackFile(self.folder / TRACK, until, self.config.environment.grid)
         self.keeper = Keeper(checkpoint, self.warnings)
         recorded = self.config.model_copy(update={**AS_WRITTEN, "delay_s": {}})  # which has been applied
         try:
@@ -587,6 +594,27 @@ class Files:
     def close(self) -> None:
         self.keeper.close()
         self.recorder.close()
+
+
+def _newest_event(path: Path) -> float:
+    """Time of the newest event of a file, -inf without one [s]; a last line that is torn is cut off.
+
+    Raises
+    ------
+    InputError : the file cannot be read or written
+    """
+    with _one_line(path):
+        if not path.exists():
+            return -np.inf
+        content = path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            os.truncate(path, len(whole))
+    times = []
+    for line in whole.splitlines():
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # blank after a power cut; before there was a time
+            times.append(float(json.loads(line)["time"]))
+    return max(times, default=-np.inf)
 
 
 def _last_rows(path: Path, origin: Origin | None) -> pd.DataFrame:

@@ -24,6 +24,7 @@ from rovgraph.inference.resolve import WITHIN_S
 from rovgraph.live.message import GEODETIC, ON_EARTH, SHIP_GEODETIC, Reading
 from rovgraph.log import Measurement, gathered
 from rovgraph.log.streams import SPACING_S, STREAMS, label_number, precedence
+from rovgraph.log.units import UNITS
 from rovgraph.model.calibration import ACOUSTICS, WATER_LAYER
 from rovgraph.model.config import Config, Mag
 from rovgraph.model.origin import Frame, Origin, lat_lon, north_east, origin_in
@@ -33,9 +34,10 @@ from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 from rovgraph.sensors.dvl_sound import CORRECTED, SoundCorrection, WaterState
 from rovgraph.sensors.instruments import instruments
-from rovgraph.sensors.pressure import DepthByPressure
+from rovgraph.sensors.pressure import DepthByPressure, units_of_air
 from rovgraph.sensors.water_layer import CELLS
 
+TOO_LITTLE = "less than any air's"  # of a pressure
 _STREAM = {GEODETIC: "fix", SHIP_GEODETIC: "ship", "pressure": "depth"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
@@ -177,9 +179,18 @@ class Intake:
         latitude = None if self.origin is None else self.origin[0]
         below = float(self.pressure.depth(np.array([value]), surface, latitude)[0])
         if math.isnan(below):
-            self._left_out["pressure", "less than any air's"] += 1
+            if not self._left_out["pressure", TOO_LITTLE]:
+                self.news.append(("pressure", self._of_too_little(value)))
+            self._left_out["pressure", TOO_LITTLE] += 1
             return None
         return below
+
+    def _of_too_little(self, pascal: float) -> str:
+        """What to state of a pressure that no air has."""
+        units = UNITS["pressure"]
+        meant = units_of_air(pascal / units[self.config.units.get("pressure", "Pa")], units)
+        remedy = f"state units: {{pressure: {meant[-1]}}}" if meant else "state its unit under units: pressure"
+        return f"{pascal:.4g} Pa is {TOO_LITTLE}, left out: {remedy}, or depth.surface_hpa: 0 if the air's is taken off"
 
     def _is_vehicles(self, beacon: float) -> bool:
         """Whether a fix is of the vehicle: without a name, or of the beacon that is stated, else of the only one."""

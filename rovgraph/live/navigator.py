@@ -167,8 +167,8 @@ class Navigator:
         if new := {r.sensor for r in message.readings} - known:
             self._heard = {**self._heard, message.source: known | new}
 
-    def replay(self, log: Log) -> None:
-        """Take what had been received before, on the estimator's clock."""
+    def replay(self, log: Log, told: float = -np.inf) -> None:
+        """Take what had been received before, on the estimator's clock; events up to ``told`` [s] are told already."""
         if self.origin is None:
             self._intake.origin = log.origin
         known = self.engine.snapshots[0].time if self.engine is not None else -np.inf
@@ -181,6 +181,7 @@ class Navigator:
                     self._consider(accepted, by_hand=accepted.sensor == "fix")  # some may be
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
+        self._events = [event for event in self._take_events() if event.time > told + 1e-6]  # as rounded there
 
     def say(self, source: str, kind: str, text: str) -> None:
         """Add an event to the next solution."""

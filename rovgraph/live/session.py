@@ -101,7 +101,7 @@ class Session:
         if self.files.received is None:
             self.navigator.say("start", "resumed", "nothing was received before: starts again")
             return
-        self.navigator.replay(self.files.received)
+        self.navigator.replay(self.files.received, self.files.told)
         self._resumed = self.navigator.time
         self.navigator.say("start", "resumed", f"continues from the data received up to {self._resumed:.1f} s")
 

@@ -30,9 +30,9 @@ def write_csv(
     path : of the file; pandas writes compressed ones
     digits : significant digits of a float
     append : to an older file, without the names
-    decimals : column -> digits after the point, of columns of floats that are all known
+    decimals : column -> digits after the point, of columns of floats that are all known; others are not looked at
     """
-    fixed = {name: f"%.{count}f" for name, count in (decimals or {}).items()}
+    fixed = {name: f"%.{count}f" for name, count in (decimals or {}).items() if name in table}
     columns = {str(name): np.asarray(values) for name, values in table.items()}
     holey = {name: bool(np.isnan(column).any()) for name, column in columns.items() if column.dtype.kind == "f"}
     formats = [fixed.get(name) or _format(column, holey.get(name, False), digits) for name, column in columns.items()]

@@ -131,14 +131,14 @@ def _add_depth(
     if found.pop("depth", None) is not None:
         warn(f"{source}: depth is ignored beside pressure; depth.source: depth uses it instead")
     pascal = pressure["pressure"]
-    if config.depth.surface_hpa is None:
+    below, said = depths(pressure.time, pascal, config, None if origin is None else origin[0])
+    known = np.isfinite(below)
+    if config.depth.surface_hpa is None or not known.any():
         written = next((name for name in names if name_and_bracket(name)[0] == PRESSURE.name), PRESSURE.name)
         unit = config.units.get(PRESSURE.name) or _units_of_header({PRESSURE.name: written}).get(PRESSURE.name, "Pa")
         factor = UNITS["pressure"][unit]
         for text in complaints(pascal, factor, UNITS["pressure"], source):
             warn(text)
-    below, said = depths(pressure.time, pascal, config, None if origin is None else origin[0])
-    known = np.isfinite(below)
     if not known.all():
         warn(f"{source}: pressure: {(~known).sum()} are less than any air's, left out")
     notes.append(said)

@@ -29,6 +29,7 @@ _ANGLE = {"rad": 1.0, "deg": _DEG}
 # kind of quantity -> unit -> factor to the unit used inside
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "duration": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "acceleration": {"m/s2": 1.0, "m/s^2": 1.0, "g": _G, "mg": 1e-3 * _G},
     "rate": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG},
     "field": {"uT": 1.0, "nT": 1e-3, "mG": 0.1, "gauss": 100.0},

@@ -805,7 +805,7 @@ class Belief:
     considered : held at the mean, but its uncertainty is in that of all else (Schmidt); False where it is estimated
     time_constant : time in which what has walked returns to the mean [s]; infinite = it does not
     score : ndarray, shape (dim,), derivative of the log likelihood that noise has taken from the measurements
-        (`rovgraph.inference.lever_arm_bias`) [1/unit]
+        (`rovgraph.inference.rate_noise`) [1/unit]
     changes : times at which it takes another value, by its sd, from its mean on; it is constant otherwise [s]
     streams : log streams that show it as it is configured; None = the variable's
     """

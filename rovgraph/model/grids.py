@@ -11,6 +11,7 @@ import numpy as np
 
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
+from rovgraph.model.origin import Origin, lat_lon
 
 KEY = "environment.grid"
 ELLIPSOID = "EPSG:4326"
@@ -112,6 +113,32 @@ def _within(lon: float, lat: float, west: float, south: float, east: float, nort
 def is_projected(crs: str) -> bool:
     """Whether a coordinate system that is known is a grid, and not in degrees."""
     return bool(_system(crs, "crs").is_projected)
+
+
+PLACE_DECIMALS = {"lat": 9, "lon": 9, "easting": 4, "northing": 4, "grid_north": 5, "grid_scale": 8}
+
+
+def place_columns(north: Array, east: Array, origin: Origin | None, grid: str | None = None) -> dict[str, Array]:
+    """Where places are on Earth, for tables, to be written with `PLACE_DECIMALS`: a tenth of a millimetre.
+
+    Parameters
+    ----------
+    north, east : ndarray, shape (n,) [m]
+    origin : latitude and longitude [deg] of north = east = 0; None = not known
+    grid : for the columns of `grid_columns` too; None = without
+
+    Returns
+    -------
+    dict : ``lat``, ``lon`` [deg] and those of the grid, ndarray, shape (n,); empty without an origin
+
+    Raises
+    ------
+    InputError : no such grid; it does not reach there
+    """
+    if origin is None:
+        return {}
+    lat, lon = lat_lon(north, east, origin)
+    return {"lat": lat, "lon": lon} | ({} if grid is None else grid_columns(grid, lat, lon))
 
 
 def grid_columns(grid: str, lat: Array, lon: Array) -> dict[str, Array]:

@@ -28,6 +28,7 @@ from rovgraph.log.csv_writer import write_csv
 from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.log.units import shown
 from rovgraph.model.config import Config
+from rovgraph.model.grids import PLACE_DECIMALS, place_columns
 from rovgraph.report.folder import ACOUSTICS_FILE, CURRENT_FILE, SOUNDINGS_FILE, STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.sensors import SENSORS
@@ -243,7 +244,10 @@ def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen
         write_csv(frame, folder / BEAMS_FILE, decimals={"time": 4})
     bottom = bottom_of(log, config, main)
     if bottom is not None:
-        write_csv(bottom.soundings, folder / SOUNDINGS_FILE, decimals={"time": 4})
+        found = bottom.soundings
+        north, east = (found[name].to_numpy(float) for name in ("north", "east"))
+        found = found.assign(**place_columns(north, east, log.origin, config.environment.grid))
+        write_csv(found, folder / SOUNDINGS_FILE, decimals={"time": 4, **PLACE_DECIMALS})
     left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []), frozen)
     write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 

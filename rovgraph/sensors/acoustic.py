@@ -134,19 +134,17 @@ def is_plumb(elevation: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.abs(elevation) - 0.5 * np.pi) < PLUMB)
 
 
-def _look_at_reach(values: Array, key: str) -> Iterator[Said]:
-    for k, limit, expected in (
-        (0, FARTHEST_M, f"if they are in millimetres, state units: {{{key}: mm}}"),
-        (1, 2.0 * FARTHEST_M / SLOWEST_MPS, "travel times are there and back, in seconds"),
+def _look_at_reach(values: Array, prefix: str) -> Iterator[Said]:
+    reach = FARTHEST_M, 2.0 * FARTHEST_M / SLOWEST_MPS
+    for k, what, column, own, others in (
+        (0, "ranges", "range", "m", {"mm": 1e-3}),
+        (1, "travel times", "travel_time", "s", {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
     ):
         known = values[np.isfinite(values[:, k]), k]
-        if len(known) and (median := float(np.median(known))) > limit:
-            what, unit = ("ranges", "m") if k == 0 else ("travel times", "s")
-            yield (
-                "error",
-                f"its {what} are {median:.4g} {unit} in the median, farther than sound reaches; {expected}",
-                "unit",
-            )
+        if len(known) and (median := float(np.median(known))) > reach[k]:
+            unit = next((name for name, factor in others.items() if median * factor <= reach[k]), own)
+            text = f"its {what} are {median:.4g} {own} in the median, farther than sound reaches; if they are in {unit}"
+            yield "error", f"{text}, state units: {{{prefix}{column}: {unit}}}", "unit"
 
 
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
@@ -166,13 +164,13 @@ def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:
 
 
 def _look_at_replies(values: Array, config: Config) -> Iterator[Said]:
-    yield from _look_at_reach(values, "usbl_range")
+    yield from _look_at_reach(values, "usbl_")
     yield from _look_at_directions(values, config)
     yield from look_at_sound_speed("usbl_sound_speed", values[:, -1])
 
 
 def _look_at_ranges(values: Array, config: Config) -> Iterator[Said]:
-    yield from _look_at_reach(values, "range")
+    yield from _look_at_reach(values, "")
     yield from look_at_sound_speed("range_sound_speed", values[:, -1])
 
 
@@ -205,7 +203,7 @@ USBL = Sensor(
     "usbl",
     (
         Column("usbl_range", "length", optional=True),
-        Column("usbl_travel_time", optional=True),
+        Column("usbl_travel_time", "duration", optional=True),
         Column("usbl_bearing", "angle", optional=True, group="usbl_direction"),
         Column("usbl_elevation", "angle", optional=True, group="usbl_direction"),
         *(Column(f"usbl_{axis}", "length", optional=True) for axis in "xyz"),
@@ -228,7 +226,7 @@ RANGE = Sensor(
     "range",
     (
         Column("range", "length", optional=True),
-        Column("travel_time", optional=True),
+        Column("travel_time", "duration", optional=True),
         Column("range_beacon", optional=True, label=True),
         Column("range_receiver", optional=True, label=True),
         Column("range_sd", "length", optional=True, largest=1e3),

@@ -248,7 +248,7 @@ def units_of_air(number: float, units: Mapping[str, float]) -> list[str]:
 
 
 def complaints(pascal: Array, factor: float, units: Mapping[str, float], source: str) -> Iterator[str]:
-    """Doubts about pressures in a log that states no ``depth.surface_hpa``, a line each.
+    """Doubts about pressures in a log, where ``depth.surface_hpa`` is not stated or leaves none, a line each.
 
     Parameters
     ----------

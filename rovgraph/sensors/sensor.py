@@ -31,7 +31,7 @@ NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 
 PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
 MOSTLY = 0.5  # share of a sensor's sds, from which on they are placeholders; fewer belong to uninformative measurements
 
-Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length", "area", "pressure"]
+Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length", "area", "pressure", "duration"]
 Frame = Literal["position", "velocity", "heading"]
 Level = Literal["ok", "warning", "error"]
 # what a check may find: data that are wrong, and remain so in an estimate; or not

@@ -151,6 +151,7 @@ CHECKS: tuple[Check, ...] = (
     acoustics.ships,
     acoustics.ship,
     acoustics.depths,
+    acoustics.lengths,
     acoustics.positions,
     plan,
 )
@@ -185,7 +186,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 
 
 def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: Config) -> dict[Check, list[Finding]]:
-    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading.
+    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading, units.
 
     Nor is bottom lock missed where the beams carry the dive.
     """
@@ -194,6 +195,8 @@ def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: C
         out[own] = [f for f in found[own] if f.kind != "bottom lock"]
     if any(f.kind == "axes" and f.level != "ok" for f in found[gravity]):
         out[headings] = [f for f in found[headings] if f.kind != "sign" or f.sensor == "mag"]
+    if any(f.kind == "unit" for f in found[acoustics.depths]):
+        out[acoustics.lengths] = [f for f in found[acoustics.lengths] if f.sensor != "usbl"]
     wrong = {f.sensor for f in out[headings] if f.kind in ("sign", "unit") and f.level != "ok"}
     heading = body_heading(log, config) if wrong else None
     if heading is not None and heading[0] in wrong:

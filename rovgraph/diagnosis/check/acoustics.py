@@ -31,9 +31,11 @@ from rovgraph.diagnosis.check.fixes import (
     tracks,
 )
 from rovgraph.diagnosis.check.inertial import in_gap
+from rovgraph.diagnosis.trilateration import DRIFT, trilaterate
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.log import Log, Stream
+from rovgraph.kernels import measurement_row as at
+from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.units import UNITS
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config, beliefs
@@ -63,6 +65,10 @@ COARSE_M = 0.05  # noise of depths that are passed on with one digit
 NEAR_AXIS = 0.1  # sine of the angle off the vertical, below which a bearing says nothing
 COURSE_S, UNDER_WAY_MPS = 10.0, 1.0  # over which a course is taken, and the speed from which on it is one
 ENOUGH_COURSES = 6
+ENOUGH_RANGES = 80  # to a place in a stretch of the track, evenly, to tell their unit
+SCALE_OFF = 0.01  # of ranges by another speed of sound
+FITTING = 2.0  # robust cost of a range, outliers among them, up to which a unit explains them
+UNIT_EVIDENCE = 50.0  # robust cost that another unit must save
 CONCENTRATED, TURNS = 0.9, 0.9  # mean of unit vectors of angles that are one, and of courses that are not
 OFF_COURSE = np.deg2rad(30.0)  # of a ship's heading, that neither current nor wind makes on several courses
 
@@ -278,8 +284,8 @@ class _Beside:
         return found
 
     def _lag(self, axes: "_Axes") -> "_Lag | None":
-        reach = ACOUSTIC_TRACK.reach_s
-        fits = self._fits([0.0, *np.arange(EARLIEST_S, reach + STEP_S / 2, STEP_S).tolist()], axes)
+        reach, earliest = ACOUSTIC_TRACK.reach_s, EARLIEST_S - max(self.config.delay_s.get("usbl", 0.0), 0.0)
+        fits = self._fits([0.0, *np.arange(earliest, reach + STEP_S / 2, STEP_S).tolist()], axes)
         if not fits:
             return None
         best = min(fits, key=lambda lag: fits[lag].variance)
@@ -296,7 +302,7 @@ class _Beside:
         count = max(inflation(fit.left), inflation(fits[0.0].left))  # what wanders slowly looks like a lag
         before, after = (cost(side) for side in sides.values())
         bend = max((before - 2.0 * cost(fit) + after) / FINE_S**2, 1e-12)
-        sd = math.sqrt(2.0 * count / bend) if EARLIEST_S < best < reach else np.inf
+        sd = math.sqrt(2.0 * count / bend) if earliest < best < reach else np.inf
         evidence = (cost(fits[0.0]) - cost(fit)) / count
         return _Lag(best + 0.5 * (before - after) / FINE_S / bend, sd, evidence, fit)
 
@@ -496,6 +502,97 @@ def _unit_of_lengths(log: Log, config: Config, errors: Array, seen: Sightings) -
     if best is None or OPPOSITE * max(off[best], DEPTH_OFF_M / OPPOSITE) >= float(np.median(np.abs(errors))):
         return None
     return best
+
+
+def lengths(log: Log, config: Config) -> Iterator[Finding]:
+    """The unit of ranges and travel times, by the DVL's track.
+
+    Ranges from a track show a place, wherever the track begins and however it is turned: that of a beacon, or of the
+    dive's start beside the ship. It explains them in one unit alone.
+    """
+    for sensor in ("usbl", "range"):
+        if sensor not in log or sensor in unusable_acoustics(config, log.sensors) or _wrong_unit(log):
+            continue
+        stream = _sound(log, config, sensor)
+        if len(stream) >= MIN_FIXES and not (sensor == "range" and config.range.one_way):  # whose clock is free
+            yield from _length_unit(_with(log, stream), config, sensor)
+
+
+def _length_unit(log: Log, config: Config, sensor: str) -> Iterator[Finding]:
+    column, quantity = _length_column(log[sensor])
+    stated = config.units.get(column, config.units.get(sensor, "")).removeprefix("-")
+    own = UNITS[quantity].get(stated, 1.0)
+    among = [*_ranges_along_track(log, config, sensor)]
+    cost = {unit: sum(one.cost(factor / own) for one in among) for unit, factor in UNITS[quantity].items()}
+    as_read = min((unit for unit, factor in UNITS[quantity].items() if factor == own), default="")
+    if not among or not as_read:
+        return
+    best, count = min(cost, key=lambda unit: cost[unit]), sum(len(one.length) for one in among)
+    if best != as_read and cost[best] < FITTING * count and cost[best] + UNIT_EVIDENCE < cost[as_read] / BETTER:
+        text = f"its ranges do not fit the DVL's track as they are, and do if {column} is in {best}; "
+        yield Finding(sensor, "warning", f"{text}state units: {{{column}: {best}}}", "unit")
+
+
+def _length_column(stream: Stream) -> tuple[str, str]:
+    """The column that lengths come from, and its quantity."""
+    prefix = "usbl_" if stream.sensor == "usbl" else ""
+    if np.isfinite(stream["usbl_range" if prefix else "range"]).any():
+        return f"{prefix}range", "length"
+    if np.isfinite(stream[f"{prefix}travel_time"]).any():
+        return f"{prefix}travel_time", "duration"
+    return stream.sensor, "length"
+
+
+@dataclass(frozen=True)
+class _RangesAlongTrack:
+    """Ranges to one place, from points along a track that begins anywhere.
+
+    Attributes
+    ----------
+    p_n : ndarray, shape (n, 3) [m]
+    length, sd, drift : ndarray, shape (n,), of the ranges, and of the track since it began [m]
+    """
+
+    p_n: Array
+    length: Array
+    sd: Array
+    drift: Array
+
+    def cost(self, factor: float) -> float:
+        """Robust cost of the ranges where they are so many times as long, of the best place."""
+        length = factor * self.length
+        down, down_sd = float(np.median(self.p_n[:, 2])), float(np.median(length)) + DEPTH_OFF_M
+        sd = np.sqrt(self.sd**2 + self.drift**2 + (SCALE_OFF * length) ** 2)
+        return trilaterate(self.p_n, length, sd, down, down_sd)[0][1]
+
+
+def _ranges_along_track(log: Log, config: Config, sensor: str) -> Iterator[_RangesAlongTrack]:
+    """Ranges to each beacon, and to the ship, from where the DVL's track has the vehicle."""
+    acoustics = Acoustics(config, instruments(config), warns=False)
+    acoustics.take_ship(log.streams)
+    try:
+        stream = acoustics.exchanges(log[sensor], believed_lag(config, sensor)[0], Counter())
+    except InputError:  # `replies` reports it
+        return
+    dim = 3 if sensor == "usbl" else 1
+    x = stream.data[:, 2 * dim : 2 * dim + at.WIDTH]
+    fix = Stream("fix", STREAMS["fix"], stream.time, np.zeros((len(stream), len(STREAMS["fix"]))), stream.row)
+    arm_b = config.range.lever_arm_m if sensor == "range" else config.usbl.beacon_arm_m
+    found = tracks(_with(log, fix), config.with_values(fix={"lever_arm_m": arm_b}))
+    if found is None:
+        return
+    way = found.plane.at(found.way, 0.0) - found.plane.fixes
+    gone = np.interp(stream.time, found.pings.time, np.append(0.0, np.abs(np.diff(found.way)).cumsum()))
+    down = np.interp(stream.time, log["depth"].time, log["depth"]["depth"]) if "depth" in log else 0.0 * gone
+    beacon, p_n = x[:, at.BEACON_AT], np.column_stack([way.real, way.imag, down])
+    p_n = np.where(beacon[:, None] < 0.0, p_n - x[:, at.HEARD : at.HEARD + 3], p_n)
+    usable = found.plane.inside & (x[:, at.WAYS] > 0.0)
+    for one, stretch in sorted({*zip(beacon[usable].tolist(), found.plane.stretch[usable].tolist(), strict=True)}):
+        of = np.flatnonzero(usable & (beacon == one) & (found.plane.stretch == stretch))
+        if len(of) >= MIN_FIXES:
+            of = of[np.unique(np.linspace(0, len(of) - 1, ENOUGH_RANGES).astype(int))]
+            drift = DRIFT * (gone[of] - gone[of[0]])
+            yield _RangesAlongTrack(p_n[of], stream.data[of, 0], stream.data[of, dim], drift)
 
 
 def _elevations_reversed(log: Log, config: Config) -> bool:

@@ -221,14 +221,16 @@ def _clock(
 
 
 def vertical(log: Log, config: Config) -> Iterator[Finding]:
-    """The DVL's velocity downwards against the change of depth: sign and clock."""
-    if not {"dvl", "depth", "imu"} <= log.sensors or len(log["depth"]) < MIN_WINDOWS:
+    """The DVL's velocity downwards against the change of depth: unit, sign and clock."""
+    if not {"dvl", "depth"} <= log.sensors or not {"imu", "vehicle_tilt"} & log.sensors:
         return
-    pings = valid_pings(log["dvl"])
-    if len(pings) < MIN_WINDOWS:
+    pings, R_bs = valid_pings(log["dvl"]), mount_matrix(config.dvl.mount_rpy_deg)
+    if min(len(pings), len(log["depth"])) < MIN_WINDOWS:
         return
-    down = downwards(log["imu"], config, pings.time)
-    depth, dvl, window = _descents(log, config, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
+    if (unit := _depth_unit(log, config, pings, R_bs)) is not None:
+        yield unit
+        return
+    depth, dvl, window = _descents(log, config, pings, R_bs)
     f = fit(depth, dvl, window)
     closely = abs(f.correlation) > CLOSELY
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b if closely else 0.0) < ENOUGH_DIVING:
@@ -252,8 +254,6 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "if depth counts upwards, state units: {depth: -m}",
             "sign",
         )
-    elif closely and (meant := _other_units(f.slope, log, config)):
-        yield Finding("depth", "warning", f"the DVL sinks {f.slope:.3g} times as far: {meant} ({numbers})", "unit")
     else:
         low, high = (0.7, 1.4) if closely else (0.4, 2.5)  # few pings a wave lower the slope
         if low < f.slope < high:
@@ -265,6 +265,17 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     behind = Lag(-found.seconds, found.sd, found.evidence)
     against, believed = "the change of depth", believed_lag(config, "dvl", than="depth")
     yield from _clock("dvl", "vertical velocity", against, behind, DESCENT, believed, "check the clocks of both")
+
+
+def _depth_unit(log: Log, config: Config, pings: Stream, R_bs: Array) -> Finding | None:
+    """That the depth is in another unit, or a pressure, where the DVL sinks as such numbers would; else None."""
+    f = fit(*_descents(log, config, pings, R_bs, as_read=True))
+    if f.windows < MIN_WINDOWS or f.correlation < CLOSELY or max(f.sd_a, f.sd_b) < ENOUGH_DIVING:
+        return None
+    if not (meant := _other_units(f.slope, log, config)):
+        return None
+    text = f"the DVL sinks {f.slope:.3g} times as far: {meant} (correlation {f.correlation:.2f}, {f.windows} windows)"
+    return Finding("depth", "warning", text, "unit")
 
 
 def _other_units(slope: float, log: Log, config: Config) -> str:
@@ -292,14 +303,31 @@ def _other_units(slope: float, log: Log, config: Config) -> str:
     return "; ".join(said)
 
 
-def _descents(log: Log, config: Config, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
-    """Depth of the DVL, its way downwards with a mounting, and the window over which the two are compared [s]."""
-    way = integral(pings.time, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
+def _descents(
+    log: Log, config: Config, pings: Stream, R_bs: Array, as_read: bool = False
+) -> tuple[Signal, Signal, float]:
+    """Depth of the DVL, its way downwards with a mounting, and the window over which the two are compared [s].
+
+    Or those of the depth sensor, whose depth stays ``as_read``: it may be in another unit than the arm between them.
+    """
+    way = integral(pings.time, np.sum(rotate(R_bs, pings.data[:, :3]) * _down(log, config, pings.time), axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
-    depth, dvl = without_spikes(log["depth"]), Signal(pings.time, way)
-    arm_b = np.subtract(config.dvl.lever_arm_m, config.depth.lever_arm_m)
-    there = depth["depth"] + downwards(log["imu"], config, depth.time) @ arm_b
+    depth, arm_b = without_spikes(log["depth"]), np.subtract(config.dvl.lever_arm_m, config.depth.lever_arm_m)
+    if as_read:
+        there, way = depth["depth"], way - _down(log, config, pings.time) @ arm_b
+    else:
+        there = depth["depth"] + _down(log, config, depth.time) @ arm_b
+    dvl = Signal(pings.time, way)
     return _without_steps(Signal(depth.time, there), dvl, window), dvl, window
+
+
+def _down(log: Log, config: Config, time: Array) -> Array:
+    """Unit vectors downwards in b, shape (n, 3), by gravity, or without an IMU by roll and pitch."""
+    if "imu" in log:
+        return downwards(log["imu"], config, time)
+    tilt = log["vehicle_tilt"]
+    roll, pitch = (np.interp(time, tilt.time, tilt[name]) for name in ("roll", "pitch"))
+    return np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
 
 
 def _without_steps(depth: Signal, dvl: Signal, window: float) -> Signal:
@@ -316,7 +344,7 @@ def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
     if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
         return 0.0
     pings = valid_pings(log["dvl"])
-    f = fit(*_descents(log, config, pings, R_bs, downwards(log["imu"], config, pings.time)))
+    f = fit(*_descents(log, config, pings, R_bs))
     return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 

@@ -45,8 +45,8 @@ from rovgraph.inference.gauss_newton import Gates
 from rovgraph.inference.graph.batch import ANYWHERE_M, indeterminate
 from rovgraph.inference.graph.places import associated_optimum, resolved
 from rovgraph.inference.graph.values import CALIBRATION, key
-from rovgraph.inference.lever_arm_bias import without_noise_of_rates
 from rovgraph.inference.optimum import Optimum
+from rovgraph.inference.rate_noise import without_rate_noise
 from rovgraph.inference.smoother import newest_calibration, optimum, smoothed
 from rovgraph.kernels.assembly import SEGMENT
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
@@ -679,9 +679,9 @@ class IncrementalEstimator:
         best = associated_optimum(resolved(problem, self._numbers[seen]), *given)
         out = best.blocks[PLACE].believed & ~best.solution.gates[PLACE]
         if not out.any():
-            return without_noise_of_rates(best)
+            return without_rate_noise(best)
         apart = np.where(out, problem.number[seen], self._numbers[seen])
-        return without_noise_of_rates(associated_optimum(resolved(problem, apart), *given))
+        return without_rate_noise(associated_optimum(resolved(problem, apart), *given))
 
     def _take(self, count: int) -> int:
         """Take the newest keyframes of the assembly."""

@@ -1,4 +1,4 @@
-"""Spurious information of the DVL's arm, and what draws arm and scale, by the gyro's noise.
+"""What the noise of the measured rate does to the DVL's arm and scale: spurious information, and scores that draw them.
 
 A ping measures R_bs' (v + w x l) with the arm l, and the rate w is a gyro's, with an error e: errors in variables. The
 derivative by the arm has e in it, and so has the innovation, as e x l. Least squares then counts
@@ -39,13 +39,13 @@ BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: not the 
 
 
 @dataclass(frozen=True)
-class SpuriousInformation:
-    """Spurious information of the arm's three components along b from the rate's noise, each by itself.
+class RateNoiseScore:
+    """What the rate's noise adds to least squares of the arm's three components along b, each by itself, and the scale.
 
     Attributes
     ----------
-    information : ndarray, shape (3,) [1/m^2]
-    score : ndarray, shape (3,), that it takes from them [1/m]
+    information : ndarray, shape (3,), of the arm, spurious [1/m^2]
+    score : ndarray, shape (3,), that it takes from the arm's components [1/m]
     scale_score : that it takes from the DVL's scale
     """
 
@@ -71,7 +71,7 @@ class SpuriousInformation:
         return np.asarray((step + self.score * sd**2) / (1.0 - np.minimum(self.share(sd), WORTHLESS)))
 
 
-def spurious_information(best: Optimum) -> SpuriousInformation:
+def score_of_rate_noise(best: Optimum) -> RateNoiseScore:
     """F and F l of above in a dive, of the admitted measurements with their weights."""
     information, score, scale_score, followed = np.zeros(3), np.zeros(3), 0.0, _followed(best)
     dvl = {s: block for s, block in best.blocks.items() if isinstance(block.instrument.model, DvlVelocity | DvlBeam)}
@@ -88,7 +88,7 @@ def spurious_information(best: Optimum) -> SpuriousInformation:
         information += np.diag(F)
         score += F @ arm
         scale_score += float(arm @ F @ arm)
-    return SpuriousInformation(information, score, scale_score)
+    return RateNoiseScore(information, score, scale_score)
 
 
 def _of_velocity(best: Optimum, block: Measurements) -> Array:
@@ -120,14 +120,14 @@ def _followed(best: Optimum) -> Array:
     return np.asarray(0.25 * np.diag(R_nb.T @ best.newest_of_known_constants[6:9, 6:9] @ R_nb))
 
 
-def noise_moves_arm(best: Optimum, sd: Array) -> bool:
+def rate_noise_moves_arm(best: Optimum, sd: Array) -> bool:
     """Whether too much of least squares' information about the arm is spurious, of an sd of shape (3,) [m]."""
-    spurious = spurious_information(best)
+    spurious = score_of_rate_noise(best)
     most = MOST_DRAWN if isinstance(best, ChainOptimum) else MOST_DRAWN_UNCORRECTED
     return bool(((spurious.share(sd) > MOST) | (spurious.drawn(sd) > most * sd)).any())
 
 
-def without_noise_of_rates(best: Optimum) -> Optimum:
+def without_rate_noise(best: Optimum) -> Optimum:
     """The optimum without what the gyro's noise takes from an estimated arm and scale of the DVL.
 
     The arm is as the vehicle's own rates show it, and considered where these show too little.
@@ -140,11 +140,11 @@ def without_noise_of_rates(best: Optimum) -> Optimum:
     if best.unknowns.walks.get(ARM) != 0.0:
         return best
     sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])
-    if noise_moves_arm(best, sd[estimated_parts(best)[ARM]]):
+    if rate_noise_moves_arm(best, sd[estimated_parts(best)[ARM]]):
         return best.considering([ARM])
     if isinstance(best, ChainOptimum):
         for _ in range(ROUNDS):
-            best = best.with_score(ARM, spurious_information(best).score)
+            best = best.with_score(ARM, score_of_rate_noise(best).score)
     return best
 
 
@@ -153,5 +153,5 @@ def _with_scale(best: Optimum) -> Optimum:
     if best.unknowns.walks.get(SCALE) != 0.0 or not isinstance(best, ChainOptimum):
         return best
     sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])[estimated_parts(best)[SCALE]]
-    score = np.array([spurious_information(best).scale_score])
+    score = np.array([score_of_rate_noise(best).scale_score])
     return best.with_score(SCALE, score) if (score * sd > LEAST_DRAWN).all() else best
