@@ -41,6 +41,7 @@ ON_CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
 LEAST_CELLS, MOST_CELLS = 4, 80  # soundings of either line at a crossing
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
+TOGETHER = 32  # shifts of a field, whose matrices fit into a processor's cache
 SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 FALSE = 0.05  # prior share of crossings whose soundings are not those of the bottom
 HYPOTHESES = 100  # at most
@@ -364,15 +365,19 @@ class Field:
 
     def _likelihood(self, common: Array) -> tuple[Array, Array]:
         """Of g covariances of both lines, and squared residuals by their number."""
-        V = common @ self._root.T
-        L = np.linalg.cholesky(self._own - V @ np.swapaxes(V, 1, 2))
-        white = np.linalg.solve(L, (self._z - V @ self._known)[..., None])[..., 0]
-        chi2 = (white**2).sum(axis=1)
-        return -0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1), chi2 / len(self._z)
+        V, n = common @ self._root.T, len(self._z)
+        off = self._z - V @ self._known
+        bordered = np.empty((len(V), n + 1, n + 1))  # the last row of its root has the white residuals
+        bordered[:, :n, :n] = self._own - V @ np.swapaxes(V, 1, 2)
+        bordered[:, n, :n] = off
+        bordered[:, n, n] = 1.0 + (off**2).sum(axis=1) / self._relief.noise**2
+        L = np.linalg.cholesky(bordered)
+        chi2 = (L[:, n, :n] ** 2).sum(axis=1)
+        return -0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)[:, :n]).sum(axis=1), chi2 / n
 
     def at(self, shifts: Array) -> tuple[Array, Array]:
         """The field and squared residuals by their number at g shifts, shape (g,) each."""
-        parts = [shifts[k : k + 256] for k in range(0, len(shifts), 256)]
+        parts = [shifts[k : k + TOGETHER] for k in range(0, len(shifts), TOGETHER)]
         L, misfit = np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts])
         return L - self._none, misfit
 
