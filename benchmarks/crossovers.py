@@ -2,6 +2,7 @@
 
     python benchmarks/crossovers.py --surveys 20        errors of a track and soundings, drawn
     python benchmarks/crossovers.py --dives 3           dives of an independent simulator, through the command line
+    python benchmarks/crossovers.py --predicted 4       what crosslines would leave, predicted and then driven
     python benchmarks/crossovers.py --figure docs/images/crossovers.png
 
 A survey has 12 lines of 500 m, 25 m apart, and four crosslines, 10 m above a bottom whose relief is 1 m over 20 m.
@@ -13,21 +14,26 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from fault_campaign.beams import Beams, Bottom, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, run_dive, settled_rows, tracks
+from fault_campaign.judge import Dive, run_dive, settled_rows, tracks, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
 from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
+import rovgraph as rg
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
 from rovgraph.inference.crossovers import BEAMS_M, Drift, field_at, match
 from rovgraph.inference.relief import Line, lines_of
+from rovgraph.lab.crosslines import COUNTS, CrosslinePlan, plan_crosslines, plan_crosslines_after
+from rovgraph.lab.plan import SensorRates
+from rovgraph.lab.survey import Survey as Lines
 
 KNOT_S = 20.0
 WRONG_M = (
@@ -384,13 +390,15 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
     return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), level, level, depth=10.0)
 
 
-def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool, gyro_scale: float) -> Dive:
+def dive(
+    terrain: Callable[[np.random.Generator], Terrain], seed: int, size: tuple[int, float, float, int], gyro_scale: float
+) -> Dive:
     """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %.
 
     The gyro's scale decides how far it shows the deviation: an sd of 0.5 % is stated, ``gyro_scale`` is drawn.
     """
     rng = np.random.default_rng([44, seed])
-    motion = survey_motion(*(SMALL if small else Case().size))
+    motion = survey_motion(*size)
     vehicle = make_vehicle("mti", ("ahrs", "depth"))
     beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
     vehicle.imu.gyr_matrix = np.diag(1.0 + rng.normal(0.0, gyro_scale, 3))
@@ -415,7 +423,7 @@ def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
         return {"shape": shape_rms(true - rows[["north", "east"]].to_numpy(), true)}
 
     for seed in seeds:
-        made = dive(CASES[row].terrain, seed, small, gyro_scale)
+        made = dive(CASES[row].terrain, seed, SMALL if small else Case().size, gyro_scale)
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
             got = run_dive(replace(made, configuration=config), inspect=inspect)
@@ -429,6 +437,39 @@ def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
             )
 
 
+def print_predicted(row: str, seeds: range, gyro_scale: float) -> None:
+    """The sd of a small survey's lines with 0, 1, 2 and 4 crosslines: by its size, by its log, and as driven."""
+    lines, length, apart, _ = SMALL
+    end = survey_motion(lines, length, apart, 0).duration
+
+    def read(crosslines: int, seed: int) -> tuple[rg.Log, rg.Config]:
+        made = dive(CASES[row].terrain, seed, (lines, length, apart, crosslines), gyro_scale)
+        made = replace(made, configuration=merge(made.configuration, {"graph": {"crossovers": True}}))
+        with TemporaryDirectory() as folder:
+            write_dive(made, Path(folder))
+            config = rg.load_config(Path(folder) / "vehicle.yaml")
+            return rg.read_log(Path(folder) / "log.csv", config), config
+
+    for seed in seeds:
+        log, config = read(0, seed)
+        after = plan_crosslines_after(log, config)
+        centres = np.array([p.mean(axis=0) for p in after.survey.legs[after.survey.parallel]])
+        wide = float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+        size = f"{lines}x{np.ptp(after.survey.box[:, 0]):.0f}x{wide:.1f}@1"
+        before = plan_crosslines(Lines.planned(size, config), config, SensorRates(50.0, 2.0), after.relief)
+        driven = []
+        for count in (0, *COUNTS):
+            track = rg.smooth(*read(count, seed)).smoothed.trajectory
+            P = track.cov_p[track.time < end]
+            driven.append(float(np.sqrt(np.mean(P[:, 0, 0] + P[:, 1, 1]))))
+        said = (", ".join(f"{sd:.2f}" for sd in sds) for sds in (_sds(before), _sds(after), driven))
+        print(f"| {seed} | {' | '.join(said)} |", flush=True)
+
+
+def _sds(plan: CrosslinePlan) -> list[float]:
+    return [c.sd for c in plan.ranked]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", nargs="*", default=list(CASES))
@@ -436,12 +477,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
+    parser.add_argument("--predicted", type=int, default=0, help="small surveys with and without crosslines")
     parser.add_argument("--small", action="store_true", help="dives of 8 lines of 250 m, with three crosslines")
     parser.add_argument("--gyro-scale", type=float, default=0.005, help="sd of the gyro's scale errors in dives")
     parser.add_argument("--figure", help="draw a survey to this file")
     given = parser.parse_args()
     if given.figure:
         draw_figure(given.figure, CASES[given.rows[0]], given.first)
+        return
+    if given.predicted:
+        print_predicted(given.rows[0], range(given.first, given.first + given.predicted), given.gyro_scale)
         return
     if given.dives:
         print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small, given.gyro_scale)

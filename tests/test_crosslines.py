@@ -134,7 +134,7 @@ def test_relief_without_a_survey_and_a_survey_with_fixes_are_refused():
         rg.plan(config, relief=(0.3, 4.0))
     with pytest.raises(rg.InputError, match=r"relief 0\.3 inf: sd and length"):
         rg.plan(config, survey="3x60x20@1", relief=(0.3, np.inf))
-    with pytest.raises(rg.InputError, match="survey 3x60x20@1: crosslines are planned for dives without fix"):
+    with pytest.raises(rg.InputError, match="survey 3x60x20@1: it has fix; crosslines are planned"):
         rg.plan(config, survey="3x60x20@1", sensors=SensorRates(fix_interval=5.0))
 
 

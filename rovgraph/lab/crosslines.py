@@ -35,7 +35,7 @@ from rovgraph.inference.relief import Line, Relief, fit_relief, lines_of
 from rovgraph.inference.smoother import assemble
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.lab.plan import DVL_HZ, IMU_HZ, SensorRates, simulated
-from rovgraph.lab.survey import STYLE, Survey
+from rovgraph.lab.survey import STYLE, Survey, planned_swath
 from rovgraph.log import Log
 from rovgraph.model.calibration import ACOUSTICS
 from rovgraph.model.config import Config
@@ -140,19 +140,21 @@ def plan_crosslines_after(
     dive = smooth(log, _chained(config), "smoothed", progress)
     first, streams = dive.estimates[0], dive.initial.streams
     _refuse_places(log.source, streams)
+    if "imu" not in streams:
+        raise InputError(f"{log.source}: it has no IMU; crosslines are planned for dives with one")
     track, bottom, there = first.trajectory, bottom_of(log, config, first), stated_relief(relief)
     if bottom is not None and relief is not None:
         raise InputError(f"{log.source}: its ranges show the relief of the bottom; take --relief out")
     if bottom is None:
-        lines = _swath(track.time, track.rpy[:, 2], track.p_n[:, :2], np.zeros(1))
+        lines = _swath(track.time, track.rpy[:, 2], track.p_n[:, :2], planned_swath(config))
     else:
         used = bottom.soundings[bottom.soundings["used"] == 1]
         soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
         lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
         there = fit_relief(lines)
-    survey = Survey.recorded(log.source, lines)
+    survey = Survey.recorded(log.source, lines, track)
     recorded = _Driven(survey, NONE, there, track, drift_of(first, lines), lines, range(len(lines)))
-    imu_hz = 1.0 / np.median(np.diff(log.streams["imu"].time)) if "imu" in log.streams else MOST_IMU_HZ
+    imu_hz = 1.0 / np.median(np.diff(log.streams["imu"].time))
     ping_hz = 1.0 / np.median(np.diff(track.time))
     sensors = SensorRates(float(np.clip(imu_hz, *IMU_HZ)), float(np.clip(ping_hz, *DVL_HZ)))
     sources = tuple(SENSORS[s].heading_source for s in HEADING_STREAMS if s in streams)
@@ -167,7 +169,7 @@ def _chained(config: Config) -> Config:
 
 def _refuse_places(source: str, streams: Collection[str]) -> None:
     if shown := sorted(PLACES & {*streams}):
-        raise InputError(f"{source}: crosslines are planned for dives without {' and '.join(shown)}")
+        raise InputError(f"{source}: it has {' and '.join(shown)}; crosslines are planned for dead reckoning")
 
 
 def _ranked(survey: Survey, config: Config, sensors: SensorRates, relief: Relief, progress: Progress) -> list[Crossed]:

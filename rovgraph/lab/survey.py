@@ -12,6 +12,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.crossovers import ENOUGH
 from rovgraph.inference.relief import CELL_M, LINE_M, Line
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.config import Config
 from rovgraph.sensors.dvl_beam import beam_geometry
 from rovgraph.simulate import CALM, Style
@@ -72,28 +73,28 @@ class Survey:
         ):
             if wrong:
                 raise InputError(f"survey {text}: {why}")
-        beams = beam_geometry(config.dvl)
-        down = np.array([[0.0, 0.0, 1.0]]) if beams is None else beams.directions
-        down = down @ matrix_from_rpy(np.deg2rad(config.dvl.mount_rpy_deg)).T
-        swath = np.unique(np.round(ALTITUDE_M * down[:, 1] / np.abs(down[:, 2]) / CELL_M)) * CELL_M
         legs = lanes(count, length, apart) @ _axes(np.deg2rad(config.start.heading_deg or 0.0))
-        return Survey(f"survey {text}", legs, speed, swath)
+        return Survey(f"survey {text}", legs, speed, planned_swath(config))
 
     @staticmethod
-    def recorded(source: str, lines: Sequence[Line]) -> "Survey":
-        """That of some lines.
+    def recorded(source: str, lines: Sequence[Line], track: Trajectory) -> "Survey":
+        """That of some lines of a track.
 
         Raises
         ------
-        InputError : too few of them are parallel
+        InputError : too few of them are parallel, or soundings are further off than these are long
         """
-        legs = np.array([line.centre[1][[0, -1]] for line in lines]).reshape(-1, 2, 2)
-        took = np.array([np.ptp(line.centre[0]) for line in lines])
-        across, count = np.unique(np.concatenate([np.empty(0), *(x.across for x in lines)]), return_counts=True)
-        speed = float(np.median(np.linalg.norm(legs[:, 1] - legs[:, 0], axis=1) / took)) if lines else 0.0
-        survey = Survey(source, legs, speed, across[count > 0.5 * count.max(initial=0)] * CELL_M)
+        ends = np.array([(x.time.min(), x.time.max()) for x in lines]).reshape(-1, 2)
+        legs = np.stack([np.interp(ends, track.time, x) for x in track.p_n[:, :2].T], axis=-1)
+        speeds = np.linalg.norm(legs[:, 1] - legs[:, 0], axis=1) / np.ptp(ends, axis=1)
+        speed = float(np.median(speeds)) if lines else 0.0
+        wide = float(np.median([x.centre[2] for x in lines])) if lines else 0.0
+        survey = Survey(source, legs, speed, _in_cells(wide * np.array([-1.0, 0.0, 1.0])))
         if (found := int(survey.parallel.sum())) < ENOUGH:
             raise InputError(f"{source}: a survey of {ENOUGH} parallel lines or more is needed, found {found}")
+        if wide > (long := float(np.ptp(survey.box[:, 0]))):
+            off = f"its soundings are {wide:.0f} m beside lines of {long:.0f} m"
+            raise InputError(f"{source}: {off}; check the unit of its ranges")
         return survey
 
     @cached_property
@@ -146,6 +147,18 @@ class Survey:
         ends = timetable(self.route(along), self.speed)[0][1::2] + STYLE.rest + STYLE.lead
         line, way = divmod(int(np.searchsorted(ends, time)), 2)
         return -1 if way else line
+
+
+def planned_swath(config: Config) -> Array:
+    """Places to starboard of the soundings of a DVL, by its beams where these are configured, shape (s,) [m]."""
+    beams = beam_geometry(config.dvl)
+    down = np.array([[0.0, 0.0, 1.0]]) if beams is None else beams.directions
+    down = down @ matrix_from_rpy(np.deg2rad(config.dvl.mount_rpy_deg)).T
+    return _in_cells(ALTITUDE_M * down[:, 1] / np.abs(down[:, 2]))
+
+
+def _in_cells(across: Array) -> Array:
+    return np.unique(np.round(across / CELL_M)) * CELL_M
 
 
 def _axes(course: float) -> Array:

@@ -352,7 +352,7 @@ def crosslines_as_dict(plan: CrosslinePlan) -> dict[str, Any]:
     """What observability.json, plan.json and summary.json hold of crosslines."""
     return {
         "lines": int(plan.survey.parallel.sum()),
-        "course_deg": np.rad2deg(plan.survey.course) % 360.0,
+        "course_deg": np.round(np.rad2deg(plan.survey.course)) % 360.0,
         "lines_m": plan.survey.legs,
         "speed_mps": plan.survey.speed,
         "relief_sd_m": plan.relief.sd,
@@ -374,7 +374,7 @@ def crosslines_as_dict(plan: CrosslinePlan) -> dict[str, Any]:
 
 
 CROSSLINES = ("crosslines", "along the lines [m]", "minutes", "crossings", "sd [m]", "sd of the shape [m]")
-HELPS, ENOUGH = 0.9, 1.1  # share of the sd that crosslines leave, and sd over that of the best ones
+HELPS, ENOUGH = 0.9, 0.75  # share of the sd that crosslines leave, and of what most of them would take off it
 
 
 def crosslines_table(plan: CrosslinePlan) -> Table:
@@ -413,12 +413,12 @@ def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
     before, *after = plan.ranked
     if after[-1].crossings <= before.crossings:
         return ["Crosslines would show nothing: their shift is too uncertain to look for, or they cross too little"]
-    some = next(c for c in after if c.sd <= ENOUGH * min(x.sd for x in after))
+    some = next(c for c in after if before.sd - c.sd >= ENOUGH * (before.sd - min(x.sd for x in after)))
     north, east = np.round(plan.survey.corner) + 0.0
     count = {1: "One crossline", 2: "Two crosslines", 4: "Four crosslines"}[len(some.along)]
-    where = " and ".join(f"{a:.0f} m" for a in some.along)
+    where = ", ".join(f"{a:.0f}" for a in some.along)
     become = f"the survey's horizontal sd from {before.sd:.2f} m to {some.sd:.2f} m in {some.duration / 60.0:.0f} min"
-    answer = f"{count}, {where} along the lines from {north:.0f} m north, {east:.0f} m east, would bring {become}"
+    answer = f"{count}, {where} m along the lines from {north:.0f} m north, {east:.0f} m east, would bring {become}"
     if some.sd > HELPS * before.sd:
         answer = f"Crosslines would hardly help: {answer[0].lower()}{answer[1:]}"
     known = f"relief of {relief.sd:.2f} m over {relief.length:.1f} m and soundings of {relief.noise:.2f} m"
