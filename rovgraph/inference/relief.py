@@ -21,7 +21,7 @@ from rovgraph.geometry import Array
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
 SCATTER = 4.0  # sd of soundings in a cell and those beside it over what is usual, from which they are fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
-STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment
+STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment; longest silence
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
 LENGTHS_M = np.geomspace(1.0, 30.0, 12)  # of relief
@@ -82,6 +82,10 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     total = np.concatenate([[0.0], np.cumsum(e)])
     low, high = np.maximum(np.arange(len(t)) - width // 2, 0), np.minimum(np.arange(len(t)) + width // 2 + 1, len(t))
     straight = np.abs((total[high] - total[low]) / (high - low)) > STRAIGHT
+    if len(at) < STRETCH:
+        return []
+    later = np.searchsorted(at, t).clip(1, len(at) - 1)
+    straight &= at[later] - at[later - 1] < STRAIGHT_S
     p = np.stack([np.interp(t, time, axis) for axis in position.T], axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     lines, first = [], 0
