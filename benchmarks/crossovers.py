@@ -211,13 +211,12 @@ class Case:
         if self.again:
             length, width = self.size[1], (self.size[0] - 1) * self.size[2]
             across = path(self.again, width + 50.0, length / self.again, 0)[:, ::-1]
-            dives.append(across + (0.5 * length / self.again, -25.0))
-        first = np.cumsum([0, *(len(p) for p in dives)])
-        t = [np.arange(len(p)) + k + d * self.after_s for d, (p, k) in enumerate(zip(dives, first, strict=False))]
-        knots = [
-            np.append(np.arange(k, k + len(p) - 1, int(KNOT_S)), k + len(p) - 1)
-            for p, k in zip(dives, first, strict=False)
-        ]
+            dives.append(across + np.array([0.5 * length / self.again, -25.0]))
+        t, knots, first = [], [], 0
+        for dive in range(len(dives)):
+            own = np.arange(first, first := first + len(dives[dive]))
+            t.append(own + dive * self.after_s)
+            knots.append(np.append(own[: -1 : int(KNOT_S)], own[-1]))
         return np.concatenate(t), np.concatenate(dives), np.concatenate(knots)
 
     @cached_property
@@ -308,9 +307,8 @@ def draw(case: Case, seed: int) -> Survey:
     depth = terrain(p[:, None] + arm) + rng.normal(0.0, case.noise, arm.shape[:2])
     zero = case.tide * np.sin(2.0 * np.pi * t / 10000.0)
     if case.steep:
-        zero += np.cumsum(
-            np.repeat(np.random.default_rng([48, seed]).normal(0.0, case.steep, len(t) // 300 + 1), 300)[: len(t)]
-        )
+        slopes = np.random.default_rng([48, seed]).normal(0.0, case.steep, len(t) // 300 + 1)
+        zero += np.cumsum(np.repeat(slopes, 300)[: len(t)])
     if case.late:
         follows = gaussian_filter1d(terrain(p), 10.0)
         zero += np.interp(t - case.late, t, follows) - follows
