@@ -400,7 +400,7 @@ def draw_figure(path: str, case: Case, seed: int) -> None:
     true = drawn.error[[np.abs(drawn.time - time).argmin() for time in crossing.times]]
     axis = np.arange(-30.0, 30.5, 0.5)
     shifts = true[0] - true[1] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))[0]
+    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))
     image = right.pcolormesh(axis, axis, L.reshape(len(axis), -1).clip(min=-10.0), cmap="viridis")
     right.plot(0.0, 0.0, "r+", markersize=12)
     right.set(xlabel="shift from the true one, east [m]", ylabel="north [m]", aspect="equal")
