@@ -4,8 +4,10 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -31,7 +33,7 @@ from rovgraph.lab.crosslines import (
     plan_crosslines,
     plan_crosslines_after,
 )
-from rovgraph.lab.plan import SensorRates
+from rovgraph.lab.plan import Manoeuvre, SensorRates, predicted
 from rovgraph.lab.survey import Survey
 from rovgraph.report.lab import crosslines_in_words
 
@@ -97,6 +99,12 @@ def test_over_a_flat_bottom_crosslines_show_nothing(tmp_path):
 def test_what_cannot_be_planned_is_refused(tmp_path):
     survey(tmp_path, lines=2)
     log, config = read(tmp_path)
+    columns = pd.read_csv(tmp_path / "log.csv")
+    columns = columns.drop(columns=[name for name in columns if name.startswith(("acc_", "gyr_"))])
+    columns.loc[columns["ahrs_yaw"].notna(), ["roll", "pitch"]] = 0.0
+    columns.dropna(how="all", subset=columns.columns[1:]).to_csv(tmp_path / "no-imu.csv", index=False)
+    with pytest.raises(rg.InputError, match="it has no IMU"):
+        plan_crosslines_after(rg.read_log(tmp_path / "no-imu.csv", config), config)
     with pytest.raises(rg.InputError, match="3 parallel lines or more is needed, found 2"):
         plan_crosslines_after(log, config)
     with pytest.raises(rg.InputError, match="its ranges show the relief of the bottom"):
@@ -136,6 +144,30 @@ def test_relief_without_a_survey_and_a_survey_with_fixes_are_refused():
         rg.plan(config, survey="3x60x20@1", relief=(0.3, np.inf))
     with pytest.raises(rg.InputError, match="survey 3x60x20@1: it has fix; crosslines are planned"):
         rg.plan(config, survey="3x60x20@1", sensors=SensorRates(fix_interval=5.0))
+
+
+@pytest.mark.parametrize("millimetres", [False, True])
+def test_soundings_further_off_than_lines_are_long_are_of_another_unit(millimetres):
+    p = path(5, 120.0, 25.0, 0)
+    way, t = np.gradient(p, axis=0), np.arange(len(p), dtype=float)
+    across = np.linspace(-4.0, 4.0, 3) * (1000.0 if millimetres else 1.0)
+    lines = _swath(t, np.arctan2(way[:, 1], way[:, 0]), p, across)
+    track = SimpleNamespace(time=t, p_n=p)
+    if millimetres:
+        with pytest.raises(rg.InputError, match="4000 m beside lines of 117 m; check the unit of its ranges"):
+            Survey.recorded("log.csv", lines, track)
+    else:
+        recorded = Survey.recorded("log.csv", lines, track)
+        np.testing.assert_allclose(recorded.swath, [-4.0, 0.0, 4.0])
+        assert recorded.parallel.sum() == 5 and recorded.speed == pytest.approx(1.0, rel=0.05)
+
+
+def test_no_manoeuvre_leaves_less_than_is_known_before():
+    """Considered arms and tilts of the DVL make an estimate of its yaw worse than its prior on this circle."""
+    config = rg.Config.model_validate(configuration(make_vehicle("mti", ("ahrs", "depth"))))
+    config = config.with_values(calibration={"dvl_yaw": {"estimate": True, "sd_deg": 0.3}})
+    seen = predicted(Manoeuvre("circle", 0.5), config, 120.0, SensorRates())
+    assert seen.ratio.max() <= 1.0 + 1e-9
 
 
 def test_a_planned_survey_has_its_lines_and_crosslines_where_they_are_wanted():
