@@ -2,6 +2,7 @@
 
     python benchmarks/crossovers.py --surveys 20        errors of a track and soundings, drawn
     python benchmarks/crossovers.py --dives 3           dives of an independent simulator, through the command line
+    python benchmarks/crossovers.py --predicted 4       what crosslines would leave, predicted and then driven
     python benchmarks/crossovers.py --figure docs/images/crossovers.png
 
 A survey has 12 lines of 500 m, 25 m apart, and four crosslines, 10 m above a bottom whose relief is 1 m over 20 m.
@@ -13,21 +14,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from fault_campaign.beams import Beams, Bottom, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, run_dive, settled_rows, tracks
+from fault_campaign.judge import Dive, run_dive, settled_rows, tracks, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
-from scipy.ndimage import map_coordinates
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.stats import chi2
 
+import rovgraph as rg
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
-from rovgraph.inference.crossovers import Drift, field_at, match
+from rovgraph.inference.crossovers import BEAMS_M, Drift, field_at, match
 from rovgraph.inference.relief import Line, lines_of
+from rovgraph.lab.crosslines import COUNTS, CrosslinePlan, plan_crosslines, plan_crosslines_after
+from rovgraph.lab.plan import SensorRates
+from rovgraph.lab.survey import Survey as Lines
 
 KNOT_S = 20.0
 WRONG_M = (
@@ -100,6 +107,16 @@ def waves(rng: np.random.Generator) -> Terrain:
     return Terrain(20.0 + 0.5 * np.sin(2.0 * np.pi * x / length + rng.uniform(0.0, 6.28)))
 
 
+def smooth_relief(rng: np.random.Generator) -> Terrain:
+    """Much smoother than the covariance that is fitted."""
+    return Terrain(20.0 + spectrum(rng, SHAPE, 0.35, lambda k: np.exp(-((k * 5.0) ** 2))))
+
+
+def rough_relief(rng: np.random.Generator) -> Terrain:
+    """Much rougher: an exponential covariance."""
+    return Terrain(20.0 + spectrum(rng, SHAPE, 0.35, lambda k: (1.0 / 10.0**2 + k**2) ** -1.5))
+
+
 def other_relief(rng: np.random.Generator) -> Terrain:
     """Relief that no Matern describes: ridges on one half, boulders on the other, a smooth swell."""
     swell = spectrum(rng, SHAPE, 0.4, lambda k: np.exp(-((k * 20.0) ** 2)))
@@ -118,7 +135,8 @@ class Drifting:
     heading, deviation : constants [deg]; scale
     wander, wander_s : [deg, s]
     velocity : white, of the speed over ground [m/s/rtHz]
-    start : of the first place [m]
+    start : of the first place of a dive [m]
+    common : correlation of the constants of two dives
     """
 
     heading: float = 0.0
@@ -128,11 +146,12 @@ class Drifting:
     wander_s: float = 900.0
     velocity: float = 0.005
     start: float = 0.1
+    common: float = 0.5
 
-    def covariance(self, p: Array) -> Array:
-        """Of north and east at every `KNOT_S`-th place, shape (2 m, 2 m)."""
-        d = np.diff(p[:: int(KNOT_S)], axis=0)
-        m = len(d)
+    def covariance(self, t: Array, p: Array, dive: Array) -> Array:
+        """Of north and east at m knots, shape (2 m, 2 m), by their times, places, shape (m, 2), and dives."""
+        d, m = np.diff(p, axis=0) * (np.diff(dive) == 0)[:, None], len(p) - 1
+        same, own = dive[:, None] == dive, dive[1:, None] == dive[1:]
         turned, psi = np.stack([-d[:, 1], d[:, 0]], axis=-1), np.arctan2(d[:, 1], d[:, 0])
         constants = [
             np.deg2rad(self.heading) * turned,
@@ -140,15 +159,14 @@ class Drifting:
             np.deg2rad(self.deviation) * turned * np.cos(psi)[:, None],
             self.scale * d,
         ]
-        t = KNOT_S * np.arange(m)
-        K = np.deg2rad(self.wander) ** 2 * np.exp(-np.abs(t[:, None] - t) / self.wander_s)
+        K = np.deg2rad(self.wander) ** 2 * np.exp(-np.abs(t[:-1, None] - t[:-1]) / self.wander_s)
         steps = np.einsum("ia,ij,jb->iajb", turned, K, turned).reshape(2 * m, 2 * m)
-        steps += sum(np.outer(c.ravel(), c.ravel()) for c in constants)
+        alike = np.kron(np.where(own, 1.0, self.common), np.ones((2, 2)))
+        for c in constants:
+            steps += alike * np.outer(c.ravel(), c.ravel())
         steps += self.velocity**2 * KNOT_S * np.eye(2 * m)
-        total = np.kron(np.tril(np.ones((m, m))), np.eye(2))
-        P = np.zeros((2 * m + 2, 2 * m + 2))
-        P[2:, 2:] = total @ steps @ total.T
-        return P + self.start**2 * np.kron(np.ones((m + 1, m + 1)), np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
+        total = np.kron(np.tril(np.ones((m + 1, m)), -1) * same[:, 1:], np.eye(2))
+        return total @ steps @ total.T + self.start**2 * np.kron(same, np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
 
 
 MTI = Drifting(heading=0.5, deviation=0.5, scale=0.003)
@@ -162,27 +180,58 @@ LOST = Drifting(start=50.0)
 
 @dataclass
 class Case:
-    """A row of the table."""
+    """A row of the table.
+
+    Attributes
+    ----------
+    drift, terrain : of the track, and of the bottom
+    noise : of a sounding [m]
+    tide : amplitude [m], with a period of 10 000 s
+    steep : sd of what the zero of depth does in each of 5 minutes, over the way [m/m]
+    late : of the depth of a vehicle that follows the bottom [s]
+    fish : share of the time, or a school as dense as a bottom
+    altimeter : one beam
+    size : lines, their length, how far they are apart, crosslines
+    chart : what is wrong with it, or "right"
+    again : crosslines of a second dive, so long after
+    """
 
     drift: Drifting = field(default_factory=lambda: WANDER)
     terrain: Callable[[np.random.Generator], Terrain] = matern
     noise: float = 0.14
     tide: float = 0.0
+    steep: float = 0.0
+    late: float = 0.0
     fish: float = 0.0
     dense: bool = False
     altimeter: bool = False
     size: tuple[int, float, float, int] = (12, 500.0, 25.0, 4)
     chart: str | None = None
+    again: int = 0
+    after_s: float = 15_000.0
 
     @cached_property
-    def _covariance(self) -> tuple[Array, Array]:
-        P = self.drift.covariance(path(*self.size))
-        return P, np.linalg.cholesky(P)
+    def way(self) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Time and place, every second, shapes (n,), (n, 2), and which of them are knots."""
+        dives = [path(*self.size)]
+        if self.again:
+            length, width = self.size[1], (self.size[0] - 1) * self.size[2]
+            across = path(self.again, width + 50.0, length / self.again, 0)[:, ::-1]
+            dives.append(across + np.array([0.5 * length / self.again, -25.0]))
+        t, knots, first = [], [], 0
+        for dive in range(len(dives)):
+            own = np.arange(first, first := first + len(dives[dive]))
+            t.append(own + dive * self.after_s)
+            knots.append(np.append(own[: -1 : int(KNOT_S)], own[-1]))
+        return np.concatenate(t), np.concatenate(dives), np.concatenate(knots)
 
-    def errors(self, count: int) -> tuple[Array, Array]:
-        """Covariance of the track at so many knots, and its root."""
-        P, root = self._covariance
-        return P[: 2 * count, : 2 * count], root[: 2 * count, : 2 * count]
+    @cached_property
+    def covariance(self) -> tuple[Array, Array]:
+        """Of the track at its knots, and its root."""
+        t, p, knots = self.way
+        dive = np.cumsum(np.diff(t[knots], prepend=0.0) > 0.5 * self.after_s)
+        P = self.drift.covariance(t[knots], p[knots], dive)
+        return P, np.linalg.cholesky(P)
 
 
 def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> DepthChart:
@@ -214,6 +263,11 @@ CASES = {
     "fish school": Case(MTI, fish=0.15, size=SMALL),
     "dense fish school": Case(MTI, fish=0.15, dense=True, size=SMALL),
     "tide": Case(MTI, tide=1.5, size=SMALL),
+    "steep tide": Case(MTI, steep=0.04, size=SMALL),
+    "late depth": Case(MTI, late=1.0, size=SMALL),
+    "smooth relief": Case(MTI, smooth_relief, size=SMALL),
+    "rough relief": Case(MTI, rough_relief, size=SMALL),
+    "two dives": Case(replace(MTI, start=4.0), tide=1.5, size=(8, 250.0, 25.0, 0), again=4),
     "chart": Case(LOST, size=LINE, chart="right"),
     "chart with holes": Case(LOST, size=LINE, chart="holes"),
     "chart elsewhere": Case(LOST, size=LINE, chart="elsewhere"),
@@ -245,25 +299,31 @@ class Survey:
 
 def draw(case: Case, seed: int) -> Survey:
     rng = np.random.default_rng([43, seed])
-    p = path(*case.size)
-    t = np.arange(len(p), dtype=float)
-    knots = t[:: int(KNOT_S)]
-    P, root = case.errors(len(knots))
+    t, p, at = case.way
+    knots, (P, root) = t[at], case.covariance
     e = root @ rng.standard_normal(len(P))
     error = np.stack([np.interp(t, knots, axis) for axis in e.reshape(-1, 2).T], axis=-1)
     terrain = case.terrain(rng)
-    way = np.gradient(p, axis=0)
+    way = np.gradient(p, t, axis=0)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     side = np.stack([-way[:, 1], way[:, 0]], axis=-1)
     reach = 0.0 if case.altimeter else 10.0 * np.tan(np.deg2rad(22.5)) / np.sqrt(2.0)
     signs = [(0.0, 0.0)] if case.altimeter else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
     arm = np.stack([reach * (a * way + b * side) for a, b in signs], axis=1)
     depth = terrain(p[:, None] + arm) + rng.normal(0.0, case.noise, arm.shape[:2])
-    depth += case.tide * np.sin(2.0 * np.pi * t / 10000.0)[:, None]
+    zero = case.tide * np.sin(2.0 * np.pi * t / 10000.0)
+    if case.steep:
+        slopes = np.random.default_rng([48, seed]).normal(0.0, case.steep, len(t) // 300 + 1)
+        zero += np.cumsum(np.repeat(slopes, 300)[: len(t)])
+    if case.late:
+        follows = gaussian_filter1d(terrain(p), 10.0)
+        zero += np.interp(t - case.late, t, follows) - follows
+    depth += zero[:, None]
     if case.fish:
         inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
         depth -= inside[:, None] * (2.0 if case.dense else rng.uniform(0.0, 4.0, depth.shape))
-    place = (p - error)[:, None] + arm
+    beams = np.repeat(np.random.default_rng([47, seed]).normal(0.0, BEAMS_M, (len(t) // 60 + 1, 2)), 60, axis=0)
+    place = (p - error + beams[: len(t)])[:, None] + arm
     heading = np.arctan2(way[:, 1], way[:, 0])
     lines = lines_of(t, heading, p - error, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
     drift, chart = Drift(knots, np.zeros(len(P)), P), None
@@ -307,14 +367,14 @@ def survey(case: Case, seed: int) -> Outcome:
         each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(drawn.knots)))]
         nees = float(np.mean([x @ np.linalg.solve(C, x) / 2 for x, C in each]))
         H, off_chart = (
-            after.between([c.knots for c in found.closures]),
+            after.between([c.times for c in found.closures]),
             np.append(left, np.zeros(len(after.mean) - len(e))),
         )
         for k in range(0, len(H), 2):
             x, C = H[k : k + 2] @ off_chart, H[k : k + 2] @ after.P @ H[k : k + 2].T
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))
     rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
-    shape = shape_rms(left.reshape(-1, 2), drawn.true[:: int(KNOT_S)])
+    shape = shape_rms(left.reshape(-1, 2), drawn.true[np.searchsorted(drawn.time, drawn.knots)])
     used, crossings = len(found.closures), len(found.crossings)
     return Outcome(*rms, shape, nees, used, crossings, wrong, seconds, f"{found.text} {found.relief}")
 
@@ -337,10 +397,10 @@ def draw_figure(path: str, case: Case, seed: int) -> None:
     left.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
     left.legend(loc="upper right", fontsize=8)
     crossing = found.crossings[-5]
-    true = drawn.error[[np.abs(drawn.time - drawn.knots[k]).argmin() for k in crossing.knots]]
+    true = drawn.error[[np.abs(drawn.time - time).argmin() for time in crossing.times]]
     axis = np.arange(-30.0, 30.5, 0.5)
     shifts = true[0] - true[1] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))[0]
+    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))
     image = right.pcolormesh(axis, axis, L.reshape(len(axis), -1).clip(min=-10.0), cmap="viridis")
     right.plot(0.0, 0.0, "r+", markersize=12)
     right.set(xlabel="shift from the true one, east [m]", ylabel="north [m]", aspect="equal")
@@ -383,13 +443,15 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
     return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), level, level, depth=10.0)
 
 
-def dive(terrain: Callable[[np.random.Generator], Terrain], seed: int, small: bool, gyro_scale: float) -> Dive:
+def dive(
+    terrain: Callable[[np.random.Generator], Terrain], seed: int, size: tuple[int, float, float, int], gyro_scale: float
+) -> Dive:
     """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %.
 
     The gyro's scale decides how far it shows the deviation: an sd of 0.5 % is stated, ``gyro_scale`` is drawn.
     """
     rng = np.random.default_rng([44, seed])
-    motion = survey_motion(*(SMALL if small else Case().size))
+    motion = survey_motion(*size)
     vehicle = make_vehicle("mti", ("ahrs", "depth"))
     beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
     vehicle.imu.gyr_matrix = np.diag(1.0 + rng.normal(0.0, gyro_scale, 3))
@@ -414,7 +476,7 @@ def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
         return {"shape": shape_rms(true - rows[["north", "east"]].to_numpy(), true)}
 
     for seed in seeds:
-        made = dive(CASES[row].terrain, seed, small, gyro_scale)
+        made = dive(CASES[row].terrain, seed, SMALL if small else Case().size, gyro_scale)
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
             got = run_dive(replace(made, configuration=config), inspect=inspect)
@@ -428,6 +490,39 @@ def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
             )
 
 
+def print_predicted(row: str, seeds: range, gyro_scale: float) -> None:
+    """The sd of a small survey's lines with 0, 1, 2 and 4 crosslines: by its size, by its log, and as driven."""
+    lines, length, apart, _ = SMALL
+    end = survey_motion(lines, length, apart, 0).duration
+
+    def read(crosslines: int, seed: int) -> tuple[rg.Log, rg.Config]:
+        made = dive(CASES[row].terrain, seed, (lines, length, apart, crosslines), gyro_scale)
+        made = replace(made, configuration=merge(made.configuration, {"graph": {"crossovers": True}}))
+        with TemporaryDirectory() as folder:
+            write_dive(made, Path(folder))
+            config = rg.load_config(Path(folder) / "vehicle.yaml")
+            return rg.read_log(Path(folder) / "log.csv", config), config
+
+    for seed in seeds:
+        log, config = read(0, seed)
+        after = plan_crosslines_after(log, config)
+        centres = np.array([p.mean(axis=0) for p in after.survey.legs[after.survey.parallel]])
+        wide = float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+        size = f"{lines}x{np.ptp(after.survey.box[:, 0]):.0f}x{wide:.1f}@1"
+        before = plan_crosslines(Lines.planned(size, config), config, SensorRates(50.0, 2.0), after.relief)
+        driven = []
+        for count in (0, *COUNTS):
+            track = rg.smooth(*read(count, seed)).smoothed.trajectory
+            P = track.cov_p[track.time < end]
+            driven.append(float(np.sqrt(np.mean(P[:, 0, 0] + P[:, 1, 1]))))
+        said = (", ".join(f"{sd:.2f}" for sd in sds) for sds in (_sds(before), _sds(after), driven))
+        print(f"| {seed} | {' | '.join(said)} |", flush=True)
+
+
+def _sds(plan: CrosslinePlan) -> list[float]:
+    return [c.sd for c in plan.ranked]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", nargs="*", default=list(CASES))
@@ -435,12 +530,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
+    parser.add_argument("--predicted", type=int, default=0, help="small surveys with and without crosslines")
     parser.add_argument("--small", action="store_true", help="dives of 8 lines of 250 m, with three crosslines")
     parser.add_argument("--gyro-scale", type=float, default=0.005, help="sd of the gyro's scale errors in dives")
     parser.add_argument("--figure", help="draw a survey to this file")
     given = parser.parse_args()
     if given.figure:
         draw_figure(given.figure, CASES[given.rows[0]], given.first)
+        return
+    if given.predicted:
+        print_predicted(given.rows[0], range(given.first, given.first + given.predicted), given.gyro_scale)
         return
     if given.dives:
         print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small, given.gyro_scale)

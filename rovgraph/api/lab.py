@@ -23,7 +23,7 @@ from rovgraph.lab.calibrate import BeamFit, MagnetometerCalibration, NoiseReport
 from rovgraph.lab.choices import goals as read_goals
 from rovgraph.lab.choices import listed, read_known
 from rovgraph.lab.compare import Comparison
-from rovgraph.lab.crosslines import CrosslinePlan, plan_crosslines
+from rovgraph.lab.crosslines import CrosslinePlan, plan_crosslines, plan_crosslines_after, stated_relief
 from rovgraph.lab.estimators import select
 from rovgraph.lab.evaluate import read_reference
 from rovgraph.lab.misalignment import Tables, chosen, open_results, read_study
@@ -35,6 +35,7 @@ from rovgraph.lab.plan import CANDIDATES, KnownComponents, Plan, SensorRates, us
 from rovgraph.lab.plan import manoeuvres as candidates_of
 from rovgraph.lab.plan import plan as ranked
 from rovgraph.lab.runs import Case, Recorded, Run, Simulated
+from rovgraph.lab.survey import Survey
 from rovgraph.log import Log
 from rovgraph.model.config import Config, beliefs, completed, config_or_defaults
 from rovgraph.process import Progress, no_progress
@@ -274,26 +275,29 @@ class ObservabilityResult(LabResult):
 
 @dataclass(frozen=True)
 class PlanResult(LabResult):
-    """Manoeuvres, ranked by the information they would add.
+    """Manoeuvres, ranked by the information they would add, and a survey with crosslines.
 
     Attributes
     ----------
-    plan : the manoeuvres, the best first
+    plan : the manoeuvres, the best first; None where only a survey was asked about
     config : of vehicle and sensors
     about : its inputs, for ``summary.json``
+    crosslines : what they would leave of the survey's drift, if that was asked
     """
 
-    plan: Plan
+    plan: Plan | None
     config: Config
     about: Mapping[str, Any]
+    crosslines: CrosslinePlan | None = None
 
     def _write(self, folder: Path) -> None:
         """The files of ``rovgraph plan`` (docs/observability.md)."""
         from rovgraph.report.figures_lab import draw_plan
         from rovgraph.report.lab import write_plan
 
-        draw_plan(folder, self.plan)
-        write_plan(folder, self.plan, self.config, self.about)
+        if self.plan is not None:
+            draw_plan(folder, self.plan)
+        write_plan(folder, self.plan, self.config, self.about, self.crosslines)
 
 
 def observe(
@@ -327,14 +331,20 @@ def observe(
     """
     estimate = listed(estimate)
     config = estimating(config_of(log, config), estimate)
-    if relief is not None and not (crosslines and min(relief) > 0.0):
-        raise InputError(f"relief {relief}: it goes with crosslines, and sd and length of more than 0 m are expected")
+    _relief_for(relief, crosslines, "crosslines")
     with collected_warnings() as texts:
         log, _ = prepared(log, config)
         seen = observe_calibration(log, config, estimate, progress)
-        crossed = plan_crosslines(log, config, relief, progress) if crosslines else None
+        crossed = plan_crosslines_after(log, config, relief, progress) if crosslines else None
     about = {"log": log.source, "estimate": [*estimate]}
     return ObservabilityResult(seen, config, (*log.warnings, *texts), about, crossed)
+
+
+def _relief_for(relief: tuple[float, float] | None, asked: bool, what: str) -> None:
+    """Refuse relief that is none, or is not asked for."""
+    stated_relief(relief)
+    if relief is not None and not asked:
+        raise InputError(f"relief {relief[0]:g} {relief[1]:g}: it goes with {what}")
 
 
 def plan(
@@ -346,8 +356,12 @@ def plan(
     estimate: str | Sequence[str] = (),
     sensors: SensorRates = USUAL,
     progress: Progress = no_progress,
+    survey: str | None = None,
+    relief: tuple[float, float] | None = None,
 ) -> PlanResult:
-    """Rank manoeuvres by how well they would determine the calibration, before the dive.
+    """Rank manoeuvres by how well they would determine the calibration, or crosslines by what they leave of the drift.
+
+    A survey by itself asks about crosslines; with goals, known, duration or manoeuvres about these, too.
 
     Parameters
     ----------
@@ -360,15 +374,39 @@ def plan(
     estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     sensors : their rates
     progress : called at times with the current task and its progress from 0 to 1
+    survey : "8x250x25@1" for 8 lines of 250 m, 25 m apart, at 1 m/s, the first towards `start.heading_deg` or north;
+        None = no survey
+    relief : sd and correlation length of the bottom's relief under it [m]; None = 0.35 over 4.5
 
     Raises
     ------
-    InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
+    InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated; no
+        such survey, or sensors that show places in it
     """
     wanted = read_goals(goals)
     config = config_or_defaults(config)
     considered = [name for name, b in beliefs(config).items() if b.considered and {*b.variable.labels} & {*wanted}]
     config = estimating(config, [*listed(estimate), *considered])
+    _relief_for(relief, survey is not None, "a survey")
+    lines = None if survey is None else Survey.planned(survey, config)
+    result, about = None, dict[str, Any]()
+    if lines is None or wanted or manoeuvres or known is not None or duration is not None:
+        result, about = _ranked_manoeuvres(config, wanted, known, duration, manoeuvres, sensors, progress)
+    crossed = None if lines is None else plan_crosslines(lines, config, sensors, stated_relief(relief), progress)
+    about |= {"fix_interval_s": sensors.fix_interval, **({} if survey is None else {"survey": survey})}
+    return PlanResult(result, config, about, crossed)
+
+
+def _ranked_manoeuvres(
+    config: Config,
+    wanted: Mapping[str, float],
+    known: ObservabilityResult | Path | str | None,
+    duration: float | None,
+    manoeuvres: str | Sequence[str] | None,
+    sensors: SensorRates,
+    progress: Progress,
+) -> tuple[Plan, dict[str, Any]]:
+    """Manoeuvres of `plan`, and what they were ranked with."""
     names = usual(config, wanted)
     short = names == CANDIDATES and START_HEADING.name not in wanted
     duration = duration or (DURATION_S if short else SURVEY_S)
@@ -380,8 +418,7 @@ def plan(
     else:
         before, source = (None, None) if known is None else (read_known(as_path(known, "known")), str(known))
     result = ranked(config, candidates, duration, before, wanted, sensors, lambda done: progress("manoeuvres", done))
-    about = {"duration_s": duration, "known": source, "fix_interval_s": sensors.fix_interval}
-    return PlanResult(result, config, about)
+    return result, {"duration_s": duration, "known": source}
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ import typer
 from rovgraph.cli.files import Choose, ConfigPath, Files, Force, Shift, Times, name_of, read_files
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from rovgraph import SimulatedDive
     from rovgraph.lab.calibrate import MagnetometerCalibration, NoiseReport
+    from rovgraph.lab.crosslines import CrosslinePlan
 
 
 def simulate(
@@ -221,6 +223,16 @@ def compare(
 
 OBSERVATION_WIDTH = 150  # columns of a file or a pipe, which has no width of its own
 
+Relief = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        help="crosslines: sd and correlation length of the bottom's relief in m, where no log shows it; "
+        "default: 0.35 4.5",
+        metavar="SD LENGTH",
+        show_default=False,
+    ),
+]
+
 
 def observe(
     files: Files,
@@ -232,15 +244,7 @@ def observe(
     crosslines: Annotated[
         bool, typer.Option("--crosslines", help="predict what crosslines would show of the track's drift")
     ] = False,
-    relief: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            help="crosslines: sd and correlation length of the bottom's relief in m, of a log without ranges; "
-            "default: 0.35 4.5",
-            metavar="SD LENGTH",
-            show_default=False,
-        ),
-    ] = None,
+    relief: Relief = None,
     force: Force = False,
     choose: Choose = None,
     shift: Shift = None,
@@ -253,7 +257,7 @@ def observe(
     import rovgraph as rg
     from rovgraph.cli.console import console, progress_bar, say
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.lab import crosslines_in_words, crosslines_table, observability_table, words
+    from rovgraph.report.lab import observability_table, words
 
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
@@ -267,12 +271,20 @@ def observe(
     shown.print(observability_table(seen, f"what {files[0].name} shows"))
     for sentence in words(seen):
         say(shown, sentence)
-    if result.crosslines is not None:
-        if len(result.crosslines.ranked) > 1:
-            shown.print(crosslines_table(result.crosslines))
-        for sentence in crosslines_in_words(result.crosslines):
-            say(shown, sentence)
+    _print_crosslines(shown, result.crosslines)
     say(shown, f"results in {out}")
+
+
+def _print_crosslines(shown: "Console", crosslines: "CrosslinePlan | None") -> None:
+    from rovgraph.cli.console import say
+    from rovgraph.report.lab import crosslines_in_words, crosslines_table
+
+    if crosslines is None:
+        return
+    if len(crosslines.ranked) > 1:
+        shown.print(crosslines_table(crosslines))
+    for sentence in crosslines_in_words(crosslines):
+        say(shown, sentence)
 
 
 def plan(
@@ -298,12 +310,21 @@ def plan(
     estimate: Annotated[
         str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
+    survey: Annotated[
+        str | None,
+        typer.Option(
+            help="predict what crosslines would leave of a survey's drift: lines x length x distance apart @ speed, "
+            "such as 8x250x25@1; manoeuvres are then ranked only with --goal, --manoeuvres, --duration or --known",
+            show_default=False,
+        ),
+    ] = None,
+    relief: Relief = None,
     fix_interval: Annotated[float | None, typer.Option(help="seconds between position fixes; default: none")] = None,
     imu_rate: Annotated[float, typer.Option(help="rate of the IMU, 5 to 1000 Hz")] = 100.0,
     dvl_rate: Annotated[float, typer.Option(help="rate of the DVL's pings, 0.1 to 50 Hz")] = 5.6,
     force: Force = False,
 ) -> None:
-    """Rank manoeuvres by how well they would determine the calibration, before the dive.
+    """Rank manoeuvres for the calibration, and predict whether crosslines would help a survey, before the dive.
 
     Example: rovgraph plan --config vehicle.yaml --goal dvl_yaw=1deg --out plan
     """
@@ -319,11 +340,14 @@ def plan(
     sensors, wanted = SensorRates(imu_rate, dvl_rate, fix_interval), goals(goal or [])
     settings = rg.load_config(config)
     with progress_bar() as progress:
-        result = rg.plan(settings, wanted, known, duration, manoeuvres, estimate or (), sensors, progress)
+        asked = settings, wanted, known, duration, manoeuvres, estimate or (), sensors, progress, survey, relief
+        result = rg.plan(*asked)
     result.save(out, force)
     shown = console()
-    for part in fitting(plan_table(result.plan, f"manoeuvres of {result.plan.duration:g} s"), shown):
-        shown.print(part)
+    if result.plan is not None:
+        for part in fitting(plan_table(result.plan, f"manoeuvres of {result.plan.duration:g} s"), shown):
+            shown.print(part)
+    _print_crosslines(shown, result.crosslines)
     say(shown, f"results in {out}")
 
 

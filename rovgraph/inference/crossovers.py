@@ -13,7 +13,7 @@ crossing splits it into one for every peak of its field, and one in which its so
 what all hypotheses within `LEAD` of the best agree about.
 
 What a field says of a shift, beside the track and the other crossings, is found from moments about its peak
-(expectation propagation, Minka 2001), not from its curvature there: the noise of a loop closure between two knots.
+(expectation propagation, Minka 2001), not from its curvature there: the noise of a loop closure between two times.
 
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
@@ -22,23 +22,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
 from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
 from rovgraph.problem.problem import Index
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
-JITTER_M = 0.25  # sd of a shift beside the drift at knots: what it does between them, errors of beams and attitude
+BEAMS_M = 0.1  # sd of where soundings are, beside the track's error, where it is not known: 0.5 degrees at 10 m
 PIECE_M, CHART_PIECE_M = 25.0, 50.0  # of a line that is run again, or on a chart, matched by itself
 ON_CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
 LEAST_CELLS, MOST_CELLS = 4, 80  # soundings of either line at a crossing
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
+TOGETHER = 32  # shifts of a field, whose matrices fit into a processor's cache
 SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 FALSE = 0.05  # prior share of crossings whose soundings are not those of the bottom
 HYPOTHESES = 100  # at most
@@ -46,8 +49,6 @@ LEAD = 10.0  # log likelihood over the next hypothesis [nats]; those behind by t
 SAME_M = 2.5  # shifts closer than that are the same
 ENOUGH = 3  # crossings
 AGREE = 0.5  # share of the crossings about which all likely hypotheses must agree
-SHOWS = 1.0  # of a field whose residuals count [nats]
-MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
 REPEATS = 0.8  # rise of the correlation of lines with themselves: sand waves
 ROUNDS = 3  # of the search, each with crossings where the one before has them
 
@@ -59,32 +60,39 @@ class Crossing:
     Attributes
     ----------
     line, earlier : numbers of the lines, `ON_CHART` of the chart
-    knots : when it was there, of `Drift`
+    times : of both there, inf of the chart [s]
     centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
-    time : of the later line there [s]
     """
 
     line: int
     earlier: int
-    knots: tuple[int, int]
+    times: tuple[float, float]
     centre: Array
-    time: float
+
+    def beams_variance(self, sd: float) -> float:
+        """Of its shift, by where soundings are: those of one line, or of two [m^2]."""
+        return sd**2 if self.earlier == ON_CHART else 2.0 * sd**2
 
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """What soundings say of the errors of a track at two knots, in information form.
+    """What soundings say of the errors of a track at two times, in information form.
 
     Attributes
     ----------
-    knots : a, b
+    times : a, b [s]
     information : ndarray, shape (2, 2), of e(a) - e(b) [1/m^2]
     pull : ndarray, shape (2,), information times shift [1/m]
     """
 
-    knots: tuple[int, int]
+    times: tuple[float, float]
     information: Array
     pull: Array
+
+    def with_noise(self, variance: float) -> "LoopClosure":
+        """Where the shift that soundings see has a noise of its own beside the errors [m^2]."""
+        share = np.linalg.inv(np.eye(2) + variance * self.information)
+        return replace(self, information=share @ self.information, pull=share @ self.pull)
 
 
 def condition(mean: Array, P: Array, H: Array, information: Array, pull: Array) -> tuple[Array, Array]:
@@ -97,48 +105,45 @@ def condition(mean: Array, P: Array, H: Array, information: Array, pull: Array) 
 
 @dataclass(frozen=True)
 class Drift:
-    """Errors of a track at m knots, north and east.
+    """Errors of a track at m knots, north and east, and between them, where it is straight, in proportion.
 
     Attributes
     ----------
     time : ndarray, shape (m,) [s]
     mean : ndarray, shape (2 m,) [m]
     P : ndarray, shape (2 m, 2 m) [m^2]
+    beams_sd : of where soundings are beside these errors, by attitude and mounting of the beams, along any axis [m]
     """
 
     time: Array
     mean: Array
     P: Array
+    beams_sd: float = BEAMS_M
 
     def beside(self, mean: Array, sd: float) -> "Drift":
-        """With one more knot, never reached: the error of a chart's place, north and east."""
+        """With one more knot, at no time: the error of a chart's place, north and east."""
         P = np.pad(self.P, (0, 2))
         P[-2:, -2:] = sd**2 * np.eye(2)
-        return Drift(np.append(self.time, np.inf), np.append(self.mean, mean), P)
-
-    def knot(self, time: float) -> int:
-        """The one next to a time."""
-        return int(np.abs(self.time - time).argmin())
+        return replace(self, time=np.append(self.time, np.inf), mean=np.append(self.mean, mean), P=P)
 
     def at(self, time: Array) -> Array:
         """The mean at some times, shape (n, 2) [m]."""
         return np.stack([np.interp(time, self.time, axis) for axis in self.mean.reshape(-1, 2).T], axis=-1)
 
-    def between(self, ends: Sequence[tuple[int, int]]) -> Array:
-        """Derivative of k shifts, each between two knots, by the drift, shape (2 k, 2 m)."""
-        H = np.zeros((len(ends), len(self.time)))
-        for row, (a, b) in zip(H, ends, strict=True):
-            row[a] += 1.0
-            row[b] -= 1.0
-        return np.asarray(np.kron(H, np.eye(2)), float)
+    def between(self, ends: Sequence[tuple[float, float]]) -> Array:
+        """Derivative of k shifts, each between two times, by the drift, shape (2 k, 2 m)."""
+        later, earlier = np.array(ends).T
+        H = [np.interp(later, self.time, knot) - np.interp(earlier, self.time, knot) for knot in np.eye(len(self.time))]
+        return np.asarray(np.kron(np.transpose(H), np.eye(2)), float)
 
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
-        H, information = self.between([c.knots for c in closures]), np.zeros((2 * len(closures),) * 2)
+        H, information = self.between([c.times for c in closures]), np.zeros((2 * len(closures),) * 2)
         for k, closure in enumerate(closures):
             information[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = closure.information
         pull = np.array([c.pull for c in closures]).ravel()
-        return Drift(self.time, *condition(self.mean, self.P, H, information, pull))
+        mean, P = condition(self.mean, self.P, H, information, pull)
+        return replace(self, mean=mean, P=P)
 
 
 @dataclass(frozen=True)
@@ -165,13 +170,13 @@ class Crossovers:
         return {
             "relief_sd_m": self.relief.sd,
             "relief_length_m": self.relief.length,
-            "time_s": [c.time for c in self.crossings],
+            "time_s": [c.times[0] for c in self.crossings],
             "matched": self._matched(self.crossings),
         }
 
     def _matched(self, crossings: Sequence[Crossing]) -> list[bool]:
-        knots = {closure.knots for closure in self.closures}
-        return [c.knots in knots for c in crossings]
+        matched = {closure.times for closure in self.closures}
+        return [c.times in matched for c in crossings]
 
     @property
     def text(self) -> str:
@@ -187,13 +192,14 @@ class Crossovers:
         return f"crossovers: {' and '.join(counts)} matched, by {relief}{chart}"
 
 
-def drift_of(estimate: Estimate, also: Sequence[float] = ()) -> Drift:
-    """Errors of a smoothed track at its knots and at some more times, by its joint covariance."""
+def drift_of(estimate: Estimate, lines: Sequence[Line]) -> Drift:
+    """Errors of a smoothed track at its knots, the ends of lines among them, by its joint covariance."""
     track, posterior = estimate.trajectory, estimate.posterior
     assert posterior is not None
     apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
     times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
-    keyframes = np.unique(np.searchsorted(track.time, [*times, *also]).clip(max=len(track) - 1))
+    ends = [end for line in lines for end in line.centre[0][[0, -1]]]
+    keyframes = np.unique(np.searchsorted(track.time, [*times, *ends]).clip(max=len(track) - 1))
     return Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
 
 
@@ -212,10 +218,10 @@ def with_crossovers(
     beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
-    track, drift = estimate.trajectory, drift_of(estimate)
-    used = bottom.soundings[bottom.soundings["used"] == 1]
+    track, used = estimate.trajectory, bottom.soundings[bottom.soundings["used"] == 1]
     soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
+    drift = replace(drift_of(estimate, lines), beams_sd=_beams_sd(used, track))
     around, place = None, beliefs[CHART_PLACE]
     if chart is not None:
         drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
@@ -228,7 +234,7 @@ def with_crossovers(
         values = {CHART_PLACE: left.mean[-2:] if place.estimate else place.mean}
         rows = calibration_estimates({CHART_PLACE: place}, [CHART], values, shown)
         estimate = replace(estimate, calibration=[*estimate.calibration, *rows])
-        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
+        drift, left = (replace(d, time=d.time[:-1], mean=d.mean[:-2], P=d.P[:-2, :-2]) for d in (drift, left))
     if not found.closures:
         return estimate, found
     moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
@@ -242,6 +248,13 @@ def with_crossovers(
             cov_p[:, i, j] -= np.interp(track.time, left.time, np.diagonal(less[i::2, j::2]))
     corrected = replace(track, p_n=p_n, v_n=v_n, cov_p=cov_p)
     return replace(estimate, trajectory=corrected, posterior=None), found
+
+
+def _beams_sd(soundings: pd.DataFrame, track: Trajectory) -> float:
+    """Of where soundings are beside the track's error."""
+    variance = soundings["north_sd"] ** 2 + soundings["east_sd"] ** 2
+    error = np.interp(soundings["time"], track.time, track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
+    return float(np.sqrt(np.median(np.maximum(variance - error, 0.0)) / 2.0))
 
 
 def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) -> Crossovers:
@@ -258,7 +271,7 @@ def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) 
     if chart is not None and lines:
         off = chart.refused(np.concatenate([x.place for x in lines]), np.concatenate([x.depth for x in lines]))
     known = None if chart is None or off else chart.smoothed(relief)
-    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if known is not None else []
+    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k)] if known is not None else []
     for _ in range(ROUNDS):
         crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
         closures, refused = _match(lines, crossings, drift, relief, known)
@@ -282,11 +295,14 @@ def _match(
     best = hypotheses[0]
     likely = np.array([h.mean for h in hypotheses if h.score > best.score - LEAD]).reshape(-1, len(crossings), 2)
     spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
-    closures = [closure for k, closure in best.closures.items() if spread[k] < SAME_M]
+    closures = [
+        closure.with_noise(crossings[k].beams_variance(drift.beams_sd))
+        for k, closure in best.closures.items()
+        if spread[k] < SAME_M
+    ]
     gates = (
         (repetition(lines, 2.0 * reach) > REPEATS, "the bottom repeats itself, as sand waves do"),
         (best.score < LEAD, "soundings of its lines do not match"),
-        (best.misfit > MISFIT, "its soundings contradict the match"),
         (len(closures) < max(ENOUGH, AGREE * best.seen), "another match is nearly as likely"),
     )
     refused = next((why for fails, why in gates if fails), "")
@@ -315,16 +331,16 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
             for own in np.array_split(np.arange(first, last), pieces):
                 a = own[least[own].argmin()] if pieces == 1 else own[len(own) // 2]
                 b = int(apart[a].argmin())
-                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b], float(t[a])))
+                out.append(Crossing(k, j, (float(t[a]), float(t_b[b])), own_b[b]))
     return out
 
 
-def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
+def pieces_of(lines: Sequence[Line], k: int) -> list[Crossing]:
     """Pieces of a line that are on a chart."""
     t, p, _ = lines[k].centre
     count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
     middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
-    return [Crossing(k, ON_CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
+    return [Crossing(k, ON_CHART, (float(t[a]), np.inf), p[a]) for a in middle]
 
 
 class Field:
@@ -336,7 +352,7 @@ class Field:
         self._own, self._z = own[0], z - z.mean()
         self._root = np.linalg.inv(np.linalg.cholesky(own[1]))
         self._known = self._root @ (w - w.mean())
-        self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0][0]
+        self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0]
 
     def _common(self, x: Array, y: Array, shifts: Array) -> Array:
         """Covariance of the bottom's depth at places x + shift and y, shape (g, n, m)."""
@@ -344,19 +360,22 @@ class Field:
         r = np.sqrt(north * north + east * east)
         return self._relief.covariance(r) + SLOPE**2 * x @ y.T  # what a slope does over the shift is height
 
-    def _likelihood(self, common: Array) -> tuple[Array, Array]:
-        """Of g covariances of both lines, and squared residuals by their number."""
-        V = common @ self._root.T
-        L = np.linalg.cholesky(self._own - V @ np.swapaxes(V, 1, 2))
-        white = np.linalg.solve(L, (self._z - V @ self._known)[..., None])[..., 0]
-        chi2 = (white**2).sum(axis=1)
-        return -0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1), chi2 / len(self._z)
+    def _likelihood(self, common: Array) -> Array:
+        """Of g covariances of both lines."""
+        V, n = common @ self._root.T, len(self._z)
+        off = self._z - V @ self._known
+        bordered = np.empty((len(V), n + 1, n + 1))  # the last row of its root has the white residuals
+        bordered[:, :n, :n] = self._own - V @ np.swapaxes(V, 1, 2)
+        bordered[:, n, :n] = off
+        bordered[:, n, n] = 1.0 + (off**2).sum(axis=1) / self._relief.noise**2
+        L = np.linalg.cholesky(bordered)
+        chi2 = (L[:, n, :n] ** 2).sum(axis=1)
+        return np.asarray(-0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)[:, :n]).sum(axis=1))
 
-    def at(self, shifts: Array) -> tuple[Array, Array]:
-        """The field and squared residuals by their number at g shifts, shape (g,) each."""
-        parts = [shifts[k : k + 256] for k in range(0, len(shifts), 256)]
-        L, misfit = np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts])
-        return L - self._none, misfit
+    def at(self, shifts: Array) -> Array:
+        """The field at g shifts, shape (g,)."""
+        parts = [shifts[k : k + TOGETHER] for k in range(0, len(shifts), TOGETHER)]
+        return np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts]) - self._none
 
     def expected_information(self) -> Array:
         """Fisher's information on the shift where there is none, shape (2, 2) [1/m^2]: what a match is worth."""
@@ -404,7 +423,6 @@ class Hypothesis:
     score : log likelihood of the soundings over that without common relief
     closures : number of a crossing -> what its peak says
     seen : crossings so far
-    misfits : squared residuals at the peaks, by their number
     """
 
     mean: Array
@@ -412,12 +430,6 @@ class Hypothesis:
     score: float = 0.0
     closures: Mapping[int, LoopClosure] = field(default_factory=dict)
     seen: int = 0
-    misfits: tuple[float, ...] = ()
-
-    @property
-    def misfit(self) -> float:
-        """Mean of those of fields that show something."""
-        return float(np.mean(self.misfits)) if self.misfits else 1.0
 
     @property
     def sd(self) -> Array:
@@ -438,17 +450,15 @@ class Hypothesis:
         off = step * cells - m
         return cells, (off @ np.linalg.inv(V) * off).sum(axis=-1)
 
-    def branches(
-        self, k: int, knots: tuple[int, int], places: Array, L: Array, misfit: Array, far: Array
-    ) -> "list[Hypothesis]":
+    def branches(self, k: int, times: tuple[float, float], places: Array, L: Array, far: Array) -> "list[Hypothesis]":
         """One for each peak of a field times what is predicted, and one in which its soundings are not the bottom's.
 
         Parameters
         ----------
-        k, knots : the crossing
+        k, times : the crossing
         places : ndarray, shape (n, n, 2), shifts [m]
-        L, misfit, far : ndarray, shape (n, n), the field there (-inf where it is not known), its squared residuals, and
-            squared distances from what is predicted [sd^2]
+        L, far : ndarray, shape (n, n), the field there (-inf where it is not known), and squared distances from what is
+            predicted [sd^2]
         """
         from scipy.ndimage import maximum_filter  # type: ignore[attr-defined]
         from scipy.spatial import KDTree
@@ -468,7 +478,6 @@ class Hypothesis:
         place = np.stack([mean(x) for x in flat.T], axis=-1)
         off = flat - place[own]
         spread = np.array([[mean(a * b) for b in off.T] for a in off.T]).transpose(2, 0, 1) + step**2 / 12.0 * np.eye(2)
-        shown, misfits = mean(L[near]), mean(misfit[near])
         score = self.score + np.log1p(-FALSE) + np.log(mass) + density.max()
         out = [replace(self, score=self.score + float(np.log(FALSE)), seen=self.seen + 1)]
         before, H = np.linalg.inv(V), np.eye(2, len(self.mean), 2 * k)
@@ -476,10 +485,9 @@ class Hypothesis:
             value, axes = np.linalg.eigh(np.linalg.inv(spread[j]) - before)
             information = (axes * np.maximum(value, 0.0)) @ axes.T
             pull = information @ m + (information + before) @ (place[j] - m)
-            closures = {**self.closures, k: LoopClosure(knots, information, pull)}
-            also = (*self.misfits, float(misfits[j])) if shown[j] > SHOWS else self.misfits
+            closures = {**self.closures, k: LoopClosure(times, information, pull)}
             moved = condition(self.mean, self.P, H, information, pull)
-            out.append(Hypothesis(*moved, float(score[j]), closures, self.seen + 1, also))
+            out.append(Hypothesis(*moved, float(score[j]), closures, self.seen + 1))
         return out
 
 
@@ -491,8 +499,9 @@ def associate(
     Next comes the crossing that the best hypothesis predicts best.
     """
     step = float(np.clip(GRID * relief.length, *STEPS_M))
-    H = drift.between([c.knots for c in crossings])
-    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)))
+    H = drift.between([c.times for c in crossings])
+    beams = np.repeat([c.beams_variance(drift.beams_sd) for c in crossings], 2)
+    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + np.diag(beams))
     hypotheses, widest, left = [prior], 0.0, set(range(len(crossings)))
     while left:
         k = min(left, key=lambda k: hypotheses[0].sd[k])
@@ -509,14 +518,14 @@ def associate(
         predicted = hypotheses[0].shift(k)[0]
         reach = min(float(np.linalg.norm(step * cells - predicted, axis=1).max()), FARTHEST_M) + BESIDE_M
         own_field = field_at(lines, crossings[k], predicted, reach, relief, chart)
-        values = np.array(own_field.at(step * cells[known]))[:, which]
+        values = own_field.at(step * cells[known])[which]
         branches, first = [], 0
         for hypothesis, (places, distance2), own in zip(hypotheses, windows, inside, strict=True):
-            L, misfit = np.full((2, *own.shape), -np.inf)
-            L[own], misfit[own] = values[:, first : first + own.sum()]
+            L = np.full(own.shape, -np.inf)
+            L[own] = values[first : first + own.sum()]
             first += int(own.sum())
             shifts = np.asarray(step * places, float)
-            branches += hypothesis.branches(k, crossings[k].knots, shifts, L, misfit, distance2)
+            branches += hypothesis.branches(k, crossings[k].times, shifts, L, distance2)
         hypotheses = _pruned(branches)
     return hypotheses, widest
 

@@ -73,8 +73,16 @@ def without_spurious_information(best: Optimum, keyframes: Sequence[int], inform
     more = np.zeros_like(information)
     for noisier in best.noisier(keyframes):
         more += 0.5 * np.array([data_information(P, s) for P, s in zip(noisier.calibration, sd, strict=True)])
-    value, axes = np.linalg.eigh(2.0 * information - more - _by_rate_noise(best, keyframes, sd))
-    return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+    return not_negative(2.0 * information - more - _by_rate_noise(best, keyframes, sd))
+
+
+def not_negative(information: Array) -> Array:
+    """Without directions that would be known less than before, shape (..., c, c): `smooth` holds them at their priors.
+
+    Considered variables make such an estimate worse than its prior.
+    """
+    value, axes = np.linalg.eigh(information)
+    return np.asarray((axes * np.maximum(value, 0.0)[..., None, :]) @ np.swapaxes(axes, -1, -2))
 
 
 def _by_rate_noise(best: Optimum, keyframes: Sequence[int], sd: Array) -> Array:

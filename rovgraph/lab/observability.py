@@ -23,6 +23,7 @@ from rovgraph.inference.initialise import initialise
 from rovgraph.inference.observability import (
     UNOBSERVABLE_ABOVE,
     data_information,
+    not_negative,
     relative_covariance,
     verdict,
     without_spurious_information,
@@ -212,7 +213,9 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     before = np.array([np.concatenate([np.empty(0), *joint_prior_sd(dive, end).values()]) for end in ends])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)
-    information = without_spurious_information(dive, ends, seen, before) if noisy and before.size else seen
+    information = (
+        without_spurious_information(dive, ends, seen, before) if noisy and before.size else not_negative(seen)
+    )
     variables, c = [TABLE[name] for name in dive.unknowns.estimated], before.shape[1]
     calibration = relative_covariance(information) * before[:, :, None] * before[:, None, :]
     joint = np.array([_with_others(P, C) for P, C in zip(known.covariance, calibration, strict=True)])

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, rpy_from_matrix
 from rovgraph.inference.gyrocompassing import relies_on_gyro
 from rovgraph.lab.executors import cores, in_workers
 from rovgraph.lab.observability import START_HEADING, Observability, examined, joint_bits, solved
@@ -277,21 +277,30 @@ def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
 
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: SensorRates) -> Observability:
     """Predicted observability of a manoeuvre by itself."""
-    ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
-    as_written = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
     path, ship = path_of(manoeuvre, duration), None
     if manoeuvre.of_ship:
         ship, path = path, scenario("hold", duration, None, Style(waves=CALM))
         ship = ship.shifted([0.0, 0.0, -MANOEUVRE_DEPTH_M])
     elif manoeuvre.scenario in MANOEUVRES:
-        path, as_written = _above_beacons(path, as_written)
+        path, config = _above_beacons(path, config)
+    log, config = simulated(path, config, sensors, str(manoeuvre), ship)
+    return examined(solved(log, config), config, noisy=False)
+
+
+def simulated(
+    path: Path, config: Config, sensors: SensorRates, source: str, ship: Path | None = None
+) -> tuple[Log, Config]:
+    """Log of a dive without noise, and the configuration for it: as written, with the start that the path has."""
+    here = path.motion([0.0])
+    start = (*here.p_n[0], *np.rad2deg(rpy_from_matrix(here.R_nb[0])))
+    keys = ("north_m", "east_m", "down_m", "roll_deg", "pitch_deg", "heading_deg")
+    stated = {key: float(x) for key, x in zip(keys, start, strict=True) if getattr(config.start, key) is not None}
+    config = config.model_copy(update={**AS_WRITTEN, "delay_s": {}}).with_values(start=stated)
     truth = Truth(
-        as_written, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
-        fix_interval=sensors.fix_interval, ahrs_rate=ahrs, ship=ship,
+        config, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate, fix_interval=sensors.fix_interval,
+        ship=ship,
     )  # fmt: skip
-    dive = simulate(path, truth, np.random.default_rng(0))
-    log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
-    return examined(solved(log, as_written), as_written, noisy=False)
+    return Log.from_frame(simulate(path, truth, np.random.default_rng(0)).log_frame, source=source), config
 
 
 def _above_beacons(path: Path, config: Config) -> tuple[Path, Config]:

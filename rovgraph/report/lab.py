@@ -4,7 +4,7 @@ docs/compare.md, docs/studies.md and docs/observability.md describe their column
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -349,54 +349,101 @@ def observability_table(seen: Observability, title: str) -> Table:
 
 
 def crosslines_as_dict(plan: CrosslinePlan) -> dict[str, Any]:
-    """What observability.json and summary.json hold of crosslines."""
+    """What observability.json, plan.json and summary.json hold of crosslines."""
     return {
+        "lines": int(plan.survey.parallel.sum()),
+        "course_deg": np.round(np.rad2deg(plan.survey.course)) % 360.0,
+        "lines_m": plan.survey.legs,
+        "speed_mps": plan.survey.speed,
         "relief_sd_m": plan.relief.sd,
         "relief_length_m": plan.relief.length,
         "noise_m": plan.relief.noise,
         "in_words": crosslines_in_words(plan),
         "ranking": [
-            {"ends_m": c.ends, "crossings": c.crossings, "sd_m": c.sd, "shape_sd_m": c.shape_sd} for c in plan.ranked
+            {
+                "along_m": c.along,
+                "ends_m": plan.survey.crosslines(c.along),
+                "duration_s": c.duration,
+                "crossings": c.crossings,
+                "sd_m": c.sd,
+                "shape_sd_m": c.shape_sd,
+            }
+            for c in plan.ranked
         ],
     }
 
 
+CROSSLINES = ("crosslines", "along the lines [m]", "minutes", "crossings", "sd [m]", "sd of the shape [m]")
+HELPS, ENOUGH = 0.9, 0.75  # share of the sd that crosslines leave, and of what most of them would take off it
+
+
 def crosslines_table(plan: CrosslinePlan) -> Table:
     """A row per number of crosslines."""
-    title = f"crosslines of {plan.lines} lines, {plan.length:.0f} m, towards {np.rad2deg(plan.course) % 360.0:.0f}°"
+    content = crosslines_as_dict(plan)
+    title = f"crosslines after {content['lines']} lines towards {content['course_deg']:.0f}°"
     table = Table(title=escape(title), title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=0)
-    for heading in ("crosslines", "along the lines [m]", "crossings", "sd [m]", "but for shift, rotation, scale [m]"):
+    for heading in CROSSLINES:
         table.add_column(escape(heading), justify="right")
-    for c in plan.ranked:
-        where = ", ".join(f"{a:.0f}" for a in c.along)
-        count = str(len(c.along)) if len(c.along) else "as recorded"
-        table.add_row(count, where, str(c.crossings), f"{c.sd:.2f}", f"{c.shape_sd:.2f}")
+    for row in crosslines_rows(content["ranking"]):
+        table.add_row(*row)
     return table
 
 
-def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
-    """What they would show, and what not, a sentence each."""
-    if len(plan.ranked) == 1:
-        return [
-            f"Crosslines would show nothing: the bottom shows no relief above the noise of its soundings, "
-            f"{plan.relief.noise:.2f} m."
-        ]
-    before, one = plan.ranked[0], plan.ranked[1]
-    if one.crossings <= before.crossings:
-        return ["A crossline would show nothing: its shift is too uncertain to look for, or it crosses too little."]
-    north, east = np.round(plan.corner) + 0.0
-    where = " and ".join(f"{a:.0f} m" for a in one.along)
-    kind = "a" if np.isfinite(plan.relief.gain) else "an assumed"
+def crosslines_rows(ranking: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Cells under `CROSSLINES`, of the ranking in summary.json."""
     return [
-        f"A crossline {where} along the lines from {north:.0f} m north, {east:.0f} m east would leave "
-        f"{one.sd / before.sd:.0%} of the horizontal sd, if its crossings match by {kind} relief of "
-        f"{plan.relief.sd:.2f} m over {plan.relief.length:.1f} m and soundings of {plan.relief.noise:.2f} m.",
-        "No crossline shows a shift, a rotation or a scale of the whole survey; these need position fixes.",
+        (
+            str(len(c["along_m"]) or "none"),
+            ", ".join(f"{a:.0f}" for a in c["along_m"]),
+            f"{c['duration_s'] / 60.0:.0f}" if len(c["along_m"]) else "",
+            str(c["crossings"]),
+            f"{c['sd_m']:.2f}",
+            f"{c['shape_sd_m']:.2f}",
+        )
+        for c in ranking
     ]
 
 
-def write_plan(folder: Path, plan: Plan, config: Config, about: Mapping[str, Any]) -> None:
+def crosslines_in_words(plan: CrosslinePlan) -> list[str]:
+    """What they would leave, and what not, a sentence each."""
+    relief = plan.relief
+    if len(plan.ranked) == 1:
+        noise = f"the bottom shows no relief above the noise of its soundings, {relief.noise:.2f} m"
+        return [f"Crosslines would show nothing: {noise}"]
+    before, *after = plan.ranked
+    if after[-1].crossings <= before.crossings:
+        return ["Crosslines would show nothing: their shift is too uncertain to look for, or they cross too little"]
+    some = next(c for c in after if before.sd - c.sd >= ENOUGH * (before.sd - min(x.sd for x in after)))
+    north, east = np.round(plan.survey.corner) + 0.0
+    count = {1: "One crossline", 2: "Two crosslines", 4: "Four crosslines"}[len(some.along)]
+    where = ", ".join(f"{a:.0f}" for a in some.along)
+    become = f"the survey's horizontal sd from {before.sd:.2f} m to {some.sd:.2f} m in {some.duration / 60.0:.0f} min"
+    answer = f"{count}, {where} m along the lines from {north:.0f} m north, {east:.0f} m east, would bring {become}"
+    if some.sd > HELPS * before.sd:
+        answer = f"Crosslines would hardly help: {answer[0].lower()}{answer[1:]}"
+    known = f"relief of {relief.sd:.2f} m over {relief.length:.1f} m and soundings of {relief.noise:.2f} m"
+    return [
+        answer,
+        f"That holds if all crossings match, by {'a' if np.isfinite(relief.gain) else 'an assumed'} {known}; "
+        "graph.crossovers: true matches them",
+        "No crossline shows a shift, a rotation or a scale of the whole survey; these need position fixes. What is "
+        f"left without them, the shape, goes from {before.shape_sd:.2f} m to {some.shape_sd:.2f} m",
+    ]
+
+
+def write_plan(
+    folder: Path, plan: Plan | None, config: Config, about: Mapping[str, Any], crosslines: CrosslinePlan | None = None
+) -> None:
     """Write every file of ``rovgraph plan`` but the figures; parameters as of `write_observability`."""
+    content = {**STAMP, **about, **({} if plan is None else plan_as_dict(plan))}
+    content |= {} if crosslines is None else {"crosslines": crosslines_as_dict(crosslines)}
+    for name in (PLAN, SUMMARY):
+        _write(folder / name, content)
+    (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+
+
+def plan_as_dict(plan: Plan) -> dict[str, Any]:
+    """What plan.json and summary.json hold of manoeuvres."""
     ranking = [
         {
             "manoeuvre": p.manoeuvre.name,
@@ -408,10 +455,7 @@ def write_plan(folder: Path, plan: Plan, config: Config, about: Mapping[str, Any
         for p, score in zip(plan.ranked, plan.scores, strict=True)
     ]
     before = dict(zip(plan.labels, plan.before.tolist(), strict=True))
-    content = {**STAMP, **about, "goals": plan.goals, "sd_before": before, "ranking": ranking}
-    for name in (PLAN, SUMMARY):
-        _write(folder / name, content)
-    (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+    return {"goals": plan.goals, "sd_before": before, "ranking": ranking}
 
 
 def plan_table(plan: Plan, title: str) -> Table:

@@ -52,6 +52,11 @@ class Route:
             np.broadcast_to(np.asarray(crab, float), legs),
         )
 
+    @staticmethod
+    def level(points: Array, depth: float) -> "Route":
+        """A route at one depth [m] through points of shape (m, 2), north and east [m]."""
+        return Route.of(np.column_stack([points, np.full(len(points), depth)]))
+
     @property
     def lengths(self) -> Array:
         """Length of each leg [m], shape (m - 1,)."""
@@ -284,9 +289,14 @@ class Style:
         """Time that smoothing needs before and after the motion [s]."""
         return TRUNCATE * max(self.smoothing, self.turning)
 
+    @property
+    def still(self) -> float:
+        """Time of a dive that is not under way [s]."""
+        return self.rest + 2.0 * self.lead
 
-def path_along(route: Route, speed: float, duration: float, style: Style | None = None) -> Path:
-    """The path that follows a route at a speed, begins and ends at rest and lasts ``duration``.
+
+def path_along(route: Route, speed: float, duration: float | None = None, style: Style | None = None) -> Path:
+    """The path that follows a route at a speed, and begins and ends at rest.
 
     A route that is not finished in time is cut short; one finished earlier ends in waiting.
 
@@ -294,13 +304,14 @@ def path_along(route: Route, speed: float, duration: float, style: Style | None 
     ----------
     route : Route
     speed : [m/s]
-    duration : [s]
+    duration : [s], None = what the route takes
 
     Raises
     ------
     InputError : too short a duration to move at all
     """
     style = style or Style()
+    duration = float(np.ceil(route.time(speed) + style.still)) if duration is None else duration
     moving = moving_time(duration, style)
     nodes, p_n, yaw = timetable(route, speed)
     time = np.linspace(0.0, duration, int(np.ceil(duration / GRID_S)) + 1)
@@ -329,10 +340,10 @@ def smoothed(x: Array, sd: float) -> Array:
 
 def moving_time(duration: float, style: Style) -> float:
     """Time under way in a dive of ``duration``: without the rest and the ramps [s]."""
-    still = style.rest + 2.0 * style.lead
-    if not (np.isfinite(duration) and duration > still):
-        raise InputError(f"duration of {duration} s: at least {still + 1.0:.0f} s are needed, {still:.0f} s go to rest")
-    return duration - still
+    if not (np.isfinite(duration) and duration > style.still):
+        least = style.still + 1.0
+        raise InputError(f"duration of {duration} s: at least {least:.0f} s are needed, {style.still:.0f} s go to rest")
+    return duration - style.still
 
 
 def _envelope(time: Array, duration: float, style: Style) -> Array:

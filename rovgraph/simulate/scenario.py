@@ -58,15 +58,14 @@ def _once(route: Route, default_speed: float) -> Scenario:
     """A route that is followed to its end; without a speed, at the speed that takes the time given."""
 
     def make(duration: float | None, speed: float | None, style: Style) -> Path:
-        still = style.rest + 2.0 * style.lead
         if duration is None:
-            duration = float(np.ceil(route.time(speed or default_speed) + still))
+            return path_along(route, speed or default_speed, style=style)
         moving = moving_time(duration, style) - route.pause[1:].sum()
         length = (route.lengths / route.pace).sum()  # [m], a slow leg counts for more
         if moving <= 0 or (speed is not None and length / speed > moving + 1e-9):
             raise InputError(
                 f"duration of {duration} s is too short to reach the end of the route: "
-                f"{np.ceil(route.time(speed or default_speed) + still):.0f} s at {speed or default_speed} m/s"
+                f"{np.ceil(route.time(speed or default_speed) + style.still):.0f} s at {speed or default_speed} m/s"
             )
         return path_along(route, speed or length / moving, duration, style)
 
@@ -100,10 +99,14 @@ def _spiral() -> Route:
     return Route.of(points)
 
 
+def lanes(count: int, length: float, apart: float) -> Array:
+    """Ends of parallel lanes to and fro, the first one north from the origin; shape (count, 2, 2) [m]."""
+    return np.array([[(n, apart * i) for n in ((0.0, length) if i % 2 == 0 else (length, 0.0))] for i in range(count)])
+
+
 def _lawnmower() -> Route:
     """Six lanes of 25 m, 4 m apart, and back to the beginning."""
-    lanes = [(n, 4.0 * i, 8.0) for i in range(6) for n in ((0, 25) if i % 2 == 0 else (25, 0))]
-    return Route.of([*lanes, lanes[0]])
+    return Route.level(np.vstack([lanes(6, 25.0, 4.0).reshape(-1, 2), np.zeros(2)]), 8.0)
 
 
 def _falcon() -> Route:

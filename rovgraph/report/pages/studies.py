@@ -16,6 +16,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log.units import behind, shown
 from rovgraph.report.colours import SERIES
+from rovgraph.report.lab import CROSSLINES, crosslines_rows
 from rovgraph.report.pages.calibration import sentence, unit_of
 from rovgraph.report.pages.page import (
     Item,
@@ -205,6 +206,7 @@ def study_page_of(source: ResultsSource) -> Callable[[ResultsSource], str] | Non
         ("study", study_page),
         ("ranking", plan_page),
         ("verdicts", observe_page),
+        ("crosslines", plan_page),
     ):
         if key in summary:
             return maker
@@ -253,20 +255,41 @@ def observe_page(source: ResultsSource) -> str:
     return rendered(source, "What can be known", sections, clock)
 
 
+CROSSED = (("#BFD7EA", 8.0), ("#4F94CD", 4.5), ("#08306B", 1.5))  # colour and width of most crosslines, fewer, one
+
+
 def _crosslines(seen: Mapping[str, Any]) -> Section:
-    """What crosslines would leave of a survey's drift."""
-    head = ("crosslines", "crossings", "sd [m]", "but for shift, rotation, scale [m]")
-    rows = [
-        (str(len(c["ends_m"])), str(c["crossings"]), f"{c['sd_m']:.2f}", f"{c['shape_sd_m']:.2f}")
-        for c in seen["ranking"]
-    ]
-    words = [sentence(s) for s in seen["in_words"]]
-    return Section("crosslines", "Crosslines", words, [PageTable("Drift of the survey", head, rows)])
+    """What crosslines would leave of a survey's drift, and where they are."""
+    ranking = seen["ranking"]
+    drawn = [line("lines", *_drawn(seen["lines_m"]), "#8A96A3", width=1.0)]
+    for c, (colour, width) in zip(ranking[:0:-1], CROSSED, strict=False):
+        count = len(c["along_m"])
+        drawn.append(line(f"{count} crossline{'s'[: count - 1]}", *_drawn(c["ends_m"]), colour, width=width))
+    note = "The survey's own sd, without and with crosslines after it. Shape: without shift, rotation and scale of all."
+    items: list[Item] = [PageTable("Drift of the survey", CROSSLINES, crosslines_rows(ranking), note=note)]
+    if len(ranking) > 1:
+        items.append(Panel("Lines and crosslines", "east [m]", "north [m]", drawn, kind="plan", wide=False))
+    title = f"Crosslines after {seen['lines']} lines towards {seen['course_deg']:.0f}°"
+    return Section("crosslines", title, [sentence(s) for s in seen["in_words"]], items)
+
+
+def _drawn(lines: Sequence[Sequence[Sequence[float]]]) -> tuple[Array, Array]:
+    """East and north of lines, with gaps between."""
+    north, east = np.pad(np.array(lines, float), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2).T
+    return east, north
 
 
 def plan_page(source: ResultsSource) -> str:
-    """Manoeuvres, ranked."""
-    summary = source.summary
+    """Manoeuvres, ranked, and what crosslines would leave of a survey's drift."""
+    summary, sections = source.summary, list[Section]()
+    if "ranking" in summary:
+        sections.append(_manoeuvres(source, summary))
+    if "crosslines" in summary:
+        sections.append(_crosslines(summary["crosslines"]))
+    return rendered(source, "Manoeuvres, ranked" if "ranking" in summary else "A survey with crosslines", sections)
+
+
+def _manoeuvres(source: ResultsSource, summary: Mapping[str, Any]) -> Section:
     ranking = summary["ranking"]
     goals, labels = summary.get("goals") or {}, [*(summary.get("sd_before") or {})]
     labels.sort(key=lambda label: label not in goals)
@@ -286,7 +309,7 @@ def plan_page(source: ResultsSource) -> str:
     ]
     title = f"Best: {names[0]}" if names else "Best: none"
     lead = [_reached(goal, sd, (ranking[0]["sd"] or {}).get(goal)) for goal, sd in goals.items()] if ranking else []
-    return rendered(source, "Manoeuvres, ranked", [Section("plan", title, lead, items)])
+    return Section("plan", title, lead, items)
 
 
 def _reached(label: str, wanted: float, sd: float | None) -> str:
