@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rovgraph import Choices, read_log, simulate, smooth
-from rovgraph.diagnosis.check.dvl import profiles
+from rovgraph.diagnosis.check.water import profiles
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay

@@ -17,10 +17,11 @@ from rovgraph.diagnosis.check import acoustics
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
 from rovgraph.diagnosis.check.compasses import body_heading, field_of_place
-from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, profiles, ranges
+from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, ranges
 from rovgraph.diagnosis.check.findings import Finding, Report, Timing, since
 from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
+from rovgraph.diagnosis.check.water import profiles
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
 from rovgraph.inference.resolve import convergence, declination_by_place
