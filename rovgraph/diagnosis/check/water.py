@@ -22,10 +22,12 @@ from rovgraph.diagnosis.check.dvl import beside_imu
 from rovgraph.diagnosis.check.findings import Finding, valid_pings
 from rovgraph.geometry import Array, matrix_from_rpy, rotate
 from rovgraph.log import Log, Stream
+from rovgraph.log.units import UNITS
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.problem.beams import nearest
 from rovgraph.problem.layers import cells_axis, in_dvl_axes
-from rovgraph.rules import CLIPPED, remedy_of_lag
+from rovgraph.rules import CLIPPED, SURE, remedy_of_lag
+from rovgraph.sensors import Kind
 from rovgraph.sensors.dvl import VELOCITIES
 from rovgraph.sensors.water_layer import CELLS
 
@@ -35,8 +37,12 @@ BETTER_LAG = 0.6  # of the error as it stands, that another lag or sign leaves
 BESIDE_S = 1.0  # between a profile and a ping
 AS_BOTTOM_MPS = 0.05  # between cells and bottom track
 SAME_WATER_S = 600.0  # in which the current at one depth is taken as one
+TOGETHER = 0.9  # correlation of both vertical velocities, from which on their ratio is that of the units
+OTHER_UNIT, SAME_UNIT = 0.25, 0.1  # logarithm of that ratio from which on it is another one, and within which it is one
 APART = (1, 2, 4, 8, 16)  # cells that are compared: the current differs more the farther they are, and some reach less
-ENOUGH_PAIRS = 750  # of these, so that 5 sds of the ratio of their variances are
+MOST_RANGES = 512  # of the cells of profiles
+LAYERS = 1e6  # more than there are at a time
+ALIKE = 1.02  # times the least variance, up to which two explanations are not distinguished
 OTHER_WAY = 1.05  # times smaller a variance at one depth; without shear it is within 1.01
 
 
@@ -55,7 +61,7 @@ def profiles(log: Log, config: Config) -> Iterator[Finding]:
         contradicted |= finding.level != "ok"
         yield finding
     if not contradicted:
-        yield from _sense(log, config, velocity)
+        yield from _places(log, config, velocity)
     yield from _unmarked(log, cells, velocity)
 
 
@@ -83,6 +89,21 @@ def _beside_depth(log: Log, config: Config, velocity: Array) -> Iterator[Finding
     elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
         text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
         yield Finding(CELLS, "warning", f"{text}: {remedy_of_lag(config, CELLS, lags[best], LAG_STEP_S)}", "lag")
+    else:
+        yield from _speeds(config, (apart[now] + sinking.to_numpy())[inside[now]], sinking.to_numpy()[inside[now]])
+
+
+def _speeds(config: Config, by_depth: Array, sinking: Array) -> Iterator[Finding]:
+    """The unit, by the vertical velocity of n profiles and that of the depth, shape (n,)."""
+    square, both = float(sinking @ sinking), float(sinking @ by_depth)
+    if both <= TOGETHER * np.sqrt(square * float(by_depth @ by_depth)) or abs(np.log(both / square)) < OTHER_UNIT:
+        return
+    read_in = UNITS["speed"].get(config.units.get("adcp_velocity", "m/s"), 1.0)
+    fits = [u for u, f in UNITS["speed"].items() if abs(np.log(f / read_in / (both / square))) < SAME_UNIT]
+    remedy = f"state units: {{adcp_velocity: {fits[0]}}}" if fits else "correct their unit"
+    yield Finding(
+        CELLS, "warning", f"its cells sink {square / both:.3g} times as fast as the depth grows: {remedy}", "unit"
+    )
 
 
 def _beside_imu(log: Log, config: Config, velocity: Array) -> Iterator[Finding]:
@@ -104,43 +125,63 @@ def _beside_imu(log: Log, config: Config, velocity: Array) -> Iterator[Finding]:
         yield from beside_imu(beside, config, compared, CELLS)
 
 
-def _sense(log: Log, config: Config, velocity: Array) -> Iterator[Finding]:
-    """Whether cells are above or below the head, by the current that profiles of one depth have in common."""
+def _places(log: Log, config: Config, velocity: Array) -> Iterator[Finding]:
+    """Whether cells are where they are taken to be, by the current that profiles which reach one depth have in common.
+
+    They may be above the head instead of below it, and their ranges in another unit.
+    """
     cells, depth, heading = log[CELLS], log["depth"], body_heading(log, config)
     times, profile = np.unique(cells.time, return_inverse=True)
     ranges, cell = np.unique(np.round(cells["adcp_range"], 3), return_inverse=True)
-    if heading is None or len(ranges) < 2 or not np.isfinite(ranges).all():
+    if heading is None or not 1 < len(ranges) <= MOST_RANGES or not np.isfinite(ranges).all():
         return
+    R_bs, turned = mount_matrix(config.dvl.mount_rpy_deg), "down" if config.water.looks == "up" else "up"
     v = np.full((len(times), len(ranges)), np.nan, complex)
-    v[profile, cell] = rotate(mount_matrix(config.dvl.mount_rpy_deg), velocity) @ (1.0, 1.0j, 0.0)
+    v[profile, cell] = rotate(R_bs, velocity) @ (1.0, 1.0j, 0.0)
     v *= np.exp(1.0j * np.interp(times, heading[1], heading[2]))[:, None]
+    block = (times // SAME_WATER_S)[:, None]
     head, layer = np.interp(times, depth.time, depth["depth"])[:, None], float(np.median(np.diff(ranges)))
-    hour = np.broadcast_to((times // SAME_WATER_S)[:, None], v.shape)
-    below = float(np.sign((mount_matrix(config.dvl.mount_rpy_deg) @ cells_axis(config))[2]))
-    best = 1.0
-    for apart in APART:
-        if apart < len(ranges):
-            shear, middle = v[:, apart:] - v[:, :-apart], 0.5 * (ranges[apart:] + ranges[:-apart])
-            depths = (np.floor((head + s * middle) / layer) for s in (below, -below))
-            as_stated, otherwise = (_variance(shear, hour[:, apart:], at) for at in depths)
-            best = max(best, as_stated / otherwise)
-    other = "down" if config.water.looks == "up" else "up"
-    if best > OTHER_WAY:
-        text = f"profiles that reach one depth disagree {np.sqrt(best):.2g} times as much as if it looked {other}"
-        yield Finding(CELLS, "warning", f"{text}: state water.looks: {other}", "turned")
+    as_stated = float(np.sign((R_bs @ cells_axis(config))[2]))
+    read_in = config.units.get("adcp_range", "m")
+    remedies = {"state units: {adcp_range: -m}" if ranges[0] < 0.0 else f"state water.looks: {turned}": -1.0}
+    if read_in in UNITS["length"]:
+        remedies |= {
+            f"state units: {{adcp_range: {u}}}": f / UNITS["length"][read_in] for u, f in UNITS["length"].items()
+        }
+    worse = dict.fromkeys(remedies, 1.0)
+    for apart in (k for k in APART if k < len(ranges)):
+        shear, middle = v[:, apart:] - v[:, :-apart], 0.5 * (ranges[apart:] + ranges[:-apart])
+
+        def variance(times_as_far: float, shear: Array = shear, middle: Array = middle) -> tuple[float, int]:
+            at = np.floor((head + as_stated * times_as_far * middle) / (layer * abs(times_as_far)))
+            return _variance(shear, at + LAYERS * block)
+
+        stated, freedom = variance(1.0)
+        for remedy, times_as_far in remedies.items():
+            other, fewer = variance(times_as_far)
+            if min(freedom, fewer) > ENOUGH and stated > other * np.exp(SURE * np.sqrt(2.0 / min(freedom, fewer))):
+                worse[remedy] = max(worse[remedy], stated / other)
+    worst = max(worse.values())
+    if worst > OTHER_WAY:
+        remedy = next(one for one in remedies if worse[one] > worst / ALIKE)
+        text = (
+            f"{1.0 - 1.0 / worst:.0%} of the variance among profiles that reach one depth comes from where their cells"
+        )
+        kind: Kind = "unit" if "units" in remedy else "turned"
+        yield Finding(CELLS, "warning", f"{text} are taken to be: {remedy}", kind)
 
 
-def _variance(values: Array, *groups: Array) -> float:
-    """Of complex values within groups, those far off clipped; NaN with too few."""
+def _variance(values: Array, group: Array) -> tuple[float, int]:
+    """Of complex values within groups, those far off clipped, and its degrees of freedom."""
     known = np.isfinite(values)
-    of = np.unique(np.column_stack([g[known] for g in groups]), axis=0, return_inverse=True)[1].ravel()
+    of = np.unique(group[known], return_inverse=True)[1]
     count, v = np.bincount(of), values[known]
     mean = (np.bincount(of, v.real) + 1.0j * np.bincount(of, v.imag)) / np.maximum(count, 1)
     square = (np.abs(v - mean[of]) ** 2)[count[of] > 1]
-    freedom = len(square) - np.count_nonzero(count > 1)
-    if freedom < ENOUGH_PAIRS:
-        return np.nan
-    return float(np.minimum(square, CLIPPED**2 * np.median(square)).sum()) / freedom
+    freedom = int(len(square) - np.count_nonzero(count > 1))
+    if not freedom:
+        return np.nan, 0
+    return float(np.minimum(square, CLIPPED**2 * np.median(square)).sum()) / freedom, freedom
 
 
 def _unmarked(log: Log, cells: Stream, velocity: Array) -> Iterator[Finding]:
