@@ -201,7 +201,9 @@ def test_range_and_heading_of_the_table_are_not_those_of_other_sensors():
     np.testing.assert_allclose(stream["adcp_heading"], 0.1)
 
 
-def descending(seed: int = 1, knots: int | None = 4, surface_s: float = 40.0, count: int = 5, **setting: Any) -> tuple[Log, Config, Array]:
+def descending(
+    seed: int = 1, knots: int | None = 4, surface_s: float = 40.0, count: int = 5, **setting: Any
+) -> tuple[Log, Config, Array]:
     """A descent to 100 m without bottom lock in the middle, through sheared water, and where it ends."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     import water
@@ -434,8 +436,12 @@ def changed(log: Log, **factors: float) -> Log:
 
 @pytest.mark.parametrize(
     "factor, remedy",
-    [(1.0, "water.looks: down"), (100.0, "units: {adcp_range: cm}"), (1.0 / 0.3048, "units: {adcp_range: ft}")]
-    + [(-1.0, "units: {adcp_range: -m}")],
+    [
+        (1.0, "water.looks: down"),
+        (100.0, "units: {adcp_range: cm}"),
+        (1.0 / 0.3048, "units: {adcp_range: ft}"),
+        (-1.0, "units: {adcp_range: -m}"),
+    ],
 )
 def test_check_finds_where_cells_are_by_the_water_that_profiles_share(long_profiles, factor, remedy):
     """The remedy of a wrong sense leaves no finding; what a unit does to a range is what was done to it here."""

@@ -151,8 +151,8 @@ class LiveAlarms:
         self._lasting = next(self._work, self._lasting)
         if time >= self._due:
             self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
-            found, config = self._statistics(snapshot.known, engine, watches, time), engine.initial.config
-            self._look([by_far_knots(one, config, {}) for one in found], now)
+            shown, config = self._statistics(snapshot.known, engine, watches, time), engine.initial.config
+            self._look([by_far_knots(one, config, {}) for one in shown], now)
             self._counts.append({})
 
     def reinitialised(self, adopted: Adopted) -> None:

@@ -186,13 +186,16 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 
 
 def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: Config) -> dict[Check, list[Finding]]:
-    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading.
+    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading, profiles
+    of the water from the DVL whose head, clock and axes they share.
 
     Nor is bottom lock missed where the beams carry the dive.
     """
     out = dict(found)
     if any(f.kind == "bottom lock" and f.level == "ok" for f in found[beams]):
         out[own] = [f for f in found[own] if f.kind != "bottom lock"]
+    if any(f.kind in ("axes", "lag", "jump") and f.level != "ok" for f in found[dvl_and_imu]):
+        out[profiles] = [f for f in found[profiles] if f.kind not in ("axes", "lag")]
     if any(f.kind == "axes" and f.level != "ok" for f in found[gravity]):
         out[headings] = [f for f in found[headings] if f.kind != "sign" or f.sensor == "mag"]
     wrong = {f.sensor for f in out[headings] if f.kind in ("sign", "unit") and f.level != "ok"}
