@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 from rovgraph.log.frozen import HOLD
 from rovgraph.log.frozen import SURE as SURE
+from rovgraph.log.reading import delay_of
 from rovgraph.model.config import Config
 
 Severity = Literal["advice", "doubtful", "wrong"]
@@ -186,6 +187,8 @@ _ROWS = (
         2.0,
         rate=0.01,
     ),
+    # twice the fastest that bottom track has shown of real water
+    Rule("current walk", "walk of the current at one depth that was found [m/s per root second]", 0.01),
     Rule("rivals", "how far apart clear explanations put the track, rms, in its sds", 2.0, rate=1e-3),
     Rule("left out", "share of a sensor's measurements that never reached the estimate", 0.1, 0.5, rate=1e-3),
     Rule(
@@ -208,7 +211,7 @@ def remedy_of_lag(config: Config, sensor: str, lag: float, sd: float) -> str:
     if sensor == "dvl":
         entry = f"{{estimate: true, mean: {lag:.3f}, sd: {max(0.02, 3.0 * sd):.2f}}}"
         return f"correct its clock, or state calibration.dvl_time_offset: {entry}"
-    late = round(config.delay_s.get(sensor, 0.0) + lag, 4) + 0.0
+    late = round(delay_of(config, sensor) + lag, 4) + 0.0
     delay = f"state delay_s: {{{sensor}: {late:.2g}}}"
     if sensor == "usbl":
         entry = f"{{estimate: true, mean: {lag:.2g}, sd: {sd_of_lag(sd):.2g}}}"

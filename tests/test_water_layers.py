@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rovgraph import Choices, read_log, simulate, smooth
-from rovgraph.diagnosis.check.dvl import profiles
+from rovgraph.diagnosis.check.water import profiles
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.inference.error_state import replay
@@ -201,13 +201,15 @@ def test_range_and_heading_of_the_table_are_not_those_of_other_sensors():
     np.testing.assert_allclose(stream["adcp_heading"], 0.1)
 
 
-def descending(seed: int = 1, knots: int = 4, surface_s: float = 40.0, **setting: Any) -> tuple[Log, Config, Array]:
+def descending(
+    seed: int = 1, knots: int | None = 4, surface_s: float = 40.0, count: int = 5, **setting: Any
+) -> tuple[Log, Config, Array]:
     """A descent to 100 m without bottom lock in the middle, through sheared water, and where it ends."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     import water
     from fault_campaign.instruments import log_table
 
-    profiler = water.Profiler(5, 4.0, 4.0)
+    profiler = water.Profiler(count, 4.0, 4.0)
     dive, table = water.make_dive(water.Setting(profiler, surface_s=surface_s, depth=100.0, **setting), seed)
     dive.configuration["water"]["knots"] = knots
     config = Config.model_validate(dive.configuration)
@@ -416,6 +418,103 @@ def test_check_finds_a_clock_and_a_sign_by_the_depth(descent):
     turned[:, [NAMES.index(f"adcp_v{axis}") for axis in "xyz"]] *= -1.0
     away = replace(log, streams={**log.streams, CELLS: replace(stream, data=turned)})
     assert "-m/s" in findings(away, config)["sign"]
+
+
+@pytest.fixture(scope="module")
+def long_profiles() -> tuple[Log, Config]:
+    """The same descent with profiles that overlap more."""
+    return descending(0, knots=None, count=25, surface_s=60.0)[:2]
+
+
+def changed(log: Log, **factors: float) -> Log:
+    """A log with columns of its profiles times a factor."""
+    data = log[CELLS].data.copy()
+    for name, factor in factors.items():
+        data[:, NAMES.index(f"adcp_{name}")] *= factor
+    return replace(log, streams={**log.streams, CELLS: replace(log[CELLS], data=data)})
+
+
+@pytest.mark.parametrize(
+    "factor, remedy",
+    [
+        (1.0, "water.looks: down"),
+        (100.0, "units: {adcp_range: cm}"),
+        (1.0 / 0.3048, "units: {adcp_range: ft}"),
+        (-1.0, "units: {adcp_range: -m}"),
+    ],
+)
+def test_check_finds_where_cells_are_by_the_water_that_profiles_share(long_profiles, factor, remedy):
+    """The remedy of a wrong sense leaves no finding; what a unit does to a range is what was done to it here."""
+    log, config = long_profiles
+    assert findings(log, config) == {}
+    if "looks" in remedy:
+        up = config.with_values(water={"looks": "up"})
+        assert remedy in findings(log, up)["turned"]
+    else:
+        assert remedy in findings(changed(log, range=factor, cell=factor), config)["unit"]
+
+
+def test_water_without_shear_shows_nothing_of_where_cells_are(long_profiles):
+    """Whatever is stated: one current at all depths."""
+    log, config = long_profiles
+    cells, rng = log[CELLS], np.random.default_rng(4)
+    data = cells.data.copy()
+    along = [NAMES.index(f"adcp_v{axis}") for axis in "xyz"]
+    first = data[np.searchsorted(cells.time, cells.time)][:, along]  # of each profile
+    data[:, along] = first + rng.normal(0.0, [0.05, 0.05, 0.02], first.shape)
+    still = replace(log, streams={**log.streams, CELLS: replace(cells, data=data)})
+    for looks in ("down", "up"):
+        assert findings(still, config.with_values(water={"looks": looks})) == {}
+
+
+def test_check_finds_units_of_velocities_by_the_depth(long_profiles):
+    log, config = long_profiles
+    for unit, factor in (("mm/s", 1e3), ("cm/s", 1e2), ("ft/s", 1.0 / 0.3048)):
+        found = findings(changed(log, vx=factor, vy=factor, vz=factor), config)
+        assert f"units: {{adcp_velocity: {unit}}}" in found["unit"] and len(found) == 1
+
+
+def test_check_finds_a_head_that_is_turned_and_a_clock_by_the_imu(long_profiles):
+    """Level, so that the depth shows neither; the mounting that is named is the one that turns them back."""
+    log, config = long_profiles
+    cells = log[CELLS]
+    level = replace(log, streams={**log.streams, "depth": replace(log["depth"], data=0.0 * log["depth"].data + 5.0)})
+    late = replace(level, streams={**level.streams, CELLS: replace(cells, time=cells.time + 3.0)})
+    lag = findings(late, config)["lag"]
+    assert float(lag.split("delay_s: {adcp: ")[1].rstrip("}")) == pytest.approx(3.0, abs=0.2)
+    data = cells.data.copy()
+    x, y = NAMES.index("adcp_vx"), NAMES.index("adcp_vy")
+    data[:, x], data[:, y] = cells.data[:, y], -cells.data[:, x]
+    turned = replace(level, streams={**level.streams, CELLS: replace(cells, data=data)})
+    text = findings(turned, config)["axes"]
+    rpy = json.loads(text.split("dvl.mount_rpy_deg: ")[1].split("]")[0] + "]")
+    np.testing.assert_allclose(rpy, [0.0, 0.0, 90.0], atol=8.0)
+
+
+@pytest.mark.slow
+def test_a_dive_whose_head_looks_the_other_way_is_not_trusted(long_profiles):
+    log, config = long_profiles
+    up = smooth(log, config.with_values(water={"looks": "up"}))
+    assert up.verdict != "trusted" and any("state water.looks: down" in line for line in up.warnings)
+    assert smooth(log, config).verdict == "trusted"
+
+
+@pytest.mark.slow
+def test_knots_that_are_too_far_apart_are_named(long_profiles):
+    log, config = long_profiles
+    far = smooth(log, config.with_values(water={"knot_m": 100.0}), "smoothed")
+    lines = [alarm.text for alarm in far.alarms if alarm.sensor == WATER_LAYER]
+    assert lines and all("state water.knot_m: 10" in line for line in lines)
+
+
+@pytest.mark.slow
+def test_a_dive_online_says_that_its_head_looks_the_other_way(long_profiles):
+    from live import flown
+
+    log, config = long_profiles
+    up = SimpleNamespace(log=log, config=config.with_values(water={"looks": "up"}))
+    events = [e for s in flown(up, rate=1.0).solutions for e in s.events]
+    assert any(e.source == CELLS and "state water.looks: down" in e.text for e in events), events
 
 
 @pytest.mark.parametrize("marked", [False, True])

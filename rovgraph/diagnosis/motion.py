@@ -15,13 +15,14 @@ check of the log compares without an estimate, so its finding takes precedence.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from math import exp, isfinite
+from math import exp, isfinite, sqrt
 
 import numpy as np
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
-from rovgraph.diagnosis.evidence import Evidence, span, windows
+from rovgraph.diagnosis.evidence import MINUTE, Evidence, span, windows
+from rovgraph.diagnosis.unstated_noise import FAST_CURRENT
 from rovgraph.distributions import chi_square_quantile
 from rovgraph.geometry import Array, cross, rotate, transpose, wrap_angle
 from rovgraph.inference.chain_optimum import ChainOptimum
@@ -29,7 +30,7 @@ from rovgraph.inference.gauss_newton import FaultyInterval
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.kernels import motion_row
-from rovgraph.model.calibration import BEAM_SENSORS, TABLE
+from rovgraph.model.calibration import BEAM_SENSORS, LAYERS, TABLE, WATER_LAYER
 from rovgraph.model.config import Config, mount_matrix
 from rovgraph.problem.beams import solved_pings
 from rovgraph.rules import CHANCE, CLIPPED, CONTRADICTED, RULES, SETTLED_S, remedy_of_lag
@@ -157,6 +158,24 @@ def found_noise(evidence: Evidence) -> Iterator[Statistic]:
             moved,
             f"{cause}; to believe so moved the track by up to {apart[k]:.2g} m, {moved:.1f} of its sds (rms)",
             "check the instrument, and state what you know of it",
+        )
+
+
+def fast_current(evidence: Evidence) -> Iterator[Statistic]:
+    """How fast the current changes at one depth, where that was found: wrong profiles look like a restless current."""
+    knot = evidence.initial.beliefs.get(LAYERS[0])
+    if WATER_LAYER not in evidence.initial.instruments or knot is None:
+        return
+    if knot.walk > evidence.initial.config.water.walk_mps:
+        yield Statistic(
+            "current walk",
+            WATER_LAYER,
+            evidence.start,
+            evidence.end,
+            float(knot.walk),
+            f"by its profiles the current changes by {knot.walk * sqrt(MINUTE):.2g} m/s in a minute at one depth, "
+            "faster than water does",
+            FAST_CURRENT,
         )
 
 

@@ -18,9 +18,10 @@ from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span,
 from rovgraph.distributions import binomial_tail, chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
-from rovgraph.model.calibration import BEAM_SENSORS
+from rovgraph.log import Stream
+from rovgraph.model.calibration import BEAM_SENSORS, WATER_LAYER
 from rovgraph.model.config import Config
-from rovgraph.problem.layers import SIDE_LOBES
+from rovgraph.problem.layers import SIDE_LOBES, nearer_knots
 from rovgraph.problem.motion import has_constant_velocity
 from rovgraph.rules import CHANCE, RULES, USUAL_SHARE, Severity
 from rovgraph.sensors.instruments import HEADING_STREAMS
@@ -46,6 +47,7 @@ SD_KEY = {
     "usbl": "usbl.angle_sd_deg",
     "range": "range.sd_m",
     "thruster": "vehicle.acceleration_sd_mps2",
+    WATER_LAYER: "water.cell_sd_mps",
 }
 
 _CHANGING_FIELD = (
@@ -57,6 +59,12 @@ _CHANGING_FIELD = (
 def sd_key(sensor: str) -> str:
     """The configuration's key of a sensor's noise."""
     return SD_KEY.get(sensor, f"the noise of {sensor}")
+
+
+def by_far_knots(one: Statistic, config: Config, streams: Mapping[str, Stream]) -> Statistic:
+    """A figure of the layers of the water with what mends it first where their knots are too far apart."""
+    nearer = nearer_knots(config, streams) if one.sensor == WATER_LAYER else None
+    return one if nearer is None else replace(one, remedy=f"state water.knot_m: {nearer:g}")
 
 
 def rejected(evidence: Evidence) -> Iterator[Statistic]:

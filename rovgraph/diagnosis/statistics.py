@@ -16,6 +16,7 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     motion.dvl_cause,
     residuals.findings_of_check,
     motion.found_noise,
+    motion.fast_current,
     constants.contradicted_constants,
     constants.alignment_entered_twice,
     constants.moved_calibration,
@@ -42,7 +43,8 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
 
 def statistics(evidence: Evidence) -> list[Statistic]:
     """Every number of a dive, within its limits or not."""
-    return [one for function in STATISTICS for one in function(evidence)]
+    config, streams = evidence.initial.config, evidence.log.streams
+    return [residuals.by_far_knots(one, config, streams) for function in STATISTICS for one in function(evidence)]
 
 
 def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:

@@ -99,6 +99,7 @@ def _is_turned(best: ChainOptimum) -> bool:
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
 ALONE = ("fix", "ahrs")  # sensors of which only a time offset can be held at a wrong value
 LARGER = 1.5  # factor of the noise that is not as stated
+FAST_CURRENT = "check water.looks, and the axes and the clock of the profiles (rovgraph check)"
 ENOUGH = 50  # differences
 LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
 OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
@@ -115,6 +116,7 @@ class UnstatedNoise:
     values : what stands there with it; numbers, or keys of the section and theirs
     cause, done : the finding, and what is done about it
     beliefs : the same, for the dive to be solved again
+    instead : what to do where such a value means that something else is wrong
     """
 
     sensor: str
@@ -123,6 +125,7 @@ class UnstatedNoise:
     cause: str
     done: str
     beliefs: Beliefs
+    instead: str = ""
 
     @property
     def text(self) -> str:
@@ -132,7 +135,7 @@ class UnstatedNoise:
     @property
     def remedy(self) -> str:
         """The keys that state it in a configuration."""
-        return f"state {self.key}: {_as_yaml(self.values)}"
+        return self.instead or f"state {self.key}: {_as_yaml(self.values)}"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -255,7 +258,8 @@ def _restless(best: ChainOptimum) -> UnstatedNoise | None:
     cause = (
         f"the current changes {walk / best.beliefs[next(iter(knots))].walk:.2g} times as fast as water.walk_mps has it"
     )
-    return UnstatedNoise(WATER_LAYER, "water.walk_mps", walk, cause, "the faster walk is used", Beliefs(knots))
+    instead = FAST_CURRENT if walk > RULES["current walk"].doubtful else ""
+    return UnstatedNoise(WATER_LAYER, "water.walk_mps", walk, cause, "the faster walk is used", Beliefs(knots), instead)
 
 
 def noise_factor(r: Array) -> float | None:

@@ -17,6 +17,7 @@ from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
 from rovgraph.diagnosis.motion import excluded_interval, separation_of
 from rovgraph.diagnosis.residuals import (
     ENOUGH,
+    by_far_knots,
     correlated_residuals_in,
     frozen_for,
     is_one_beam,
@@ -150,7 +151,8 @@ class LiveAlarms:
         self._lasting = next(self._work, self._lasting)
         if time >= self._due:
             self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
-            self._look([*self._statistics(snapshot.known, engine, watches, time)], now)
+            shown, config = self._statistics(snapshot.known, engine, watches, time), engine.initial.config
+            self._look([by_far_knots(one, config, {}) for one in shown], now)
             self._counts.append({})
 
     def reinitialised(self, adopted: Adopted) -> None:

@@ -35,6 +35,7 @@ from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.dvl import dvl_and_imu
 from rovgraph.diagnosis.check.findings import Finding
 from rovgraph.diagnosis.check.fixes import track
+from rovgraph.diagnosis.check.water import profiles
 from rovgraph.geometry import Array
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.gauss_newton import FaultyInterval
@@ -339,7 +340,14 @@ WINDOW_S = 300.0  # of motion that is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
 AGAIN_S = 1800.0  # after which a lasting finding is reported again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
-CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track, latency)
+CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (
+    dvl_and_imu,
+    headings,
+    vertical,
+    profiles,
+    track,
+    latency,
+)
 
 
 @dataclass

@@ -88,11 +88,22 @@ def with_knots(config: Config, streams: Mapping[str, Stream], whole: bool = True
     """
     if config.water.knots is not None:
         return config
-    far = streams[CELLS].data[:, _COLUMN["adcp_range"]] if CELLS in streams else np.zeros(0)
-    reach = float(np.nanmax(far, initial=0.0))
+    reach = _reach(streams)
     spacing = max(config.water.knot_m, reach / (len(LAYERS) - 2))
     knots = min(math.ceil(reach / spacing - 1e-9) + 2, len(LAYERS)) if whole else len(LAYERS)
     return config.with_values(water={"knots": max(knots, 2), "knot_m": spacing})
+
+
+def nearer_knots(config: Config, streams: Mapping[str, Stream]) -> float | None:
+    """How far apart knots would follow the water better, where they are farther apart than the cells require [m]."""
+    least = max(Water().knot_m, _reach(streams) / (len(LAYERS) - 2))
+    return least if config.water.knot_m > least and config.water.knots != 1 else None
+
+
+def _reach(streams: Mapping[str, Stream]) -> float:
+    """The farthest range of cells [m]."""
+    far = streams[CELLS].data[:, _COLUMN["adcp_range"]] if CELLS in streams else np.zeros(0)
+    return float(np.nanmax(far, initial=0.0))
 
 
 class Cells(NamedTuple):
@@ -127,8 +138,7 @@ class WaterLayers:
         self._R_bs = mount_matrix(config.dvl.mount_rpy_deg)
         angle = config.water.beam_angle_deg or config.dvl.beams.angle_deg or USUAL_ANGLE_DEG
         self._cosine = abs(math.cos(math.radians(angle)))
-        down = self._R_bs[2, 2] >= 0.0
-        self._axis = np.array([0.0, 0.0, 1.0 if down == (config.water.looks == "down") else -1.0])
+        self._axis = cells_axis(config)
         self._arm_b = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
         self._below_sensor = np.array(config.dvl.lever_arm_m) - np.array(config.depth.lever_arm_m)
         knots = config.water.knots or len(LAYERS)
@@ -264,13 +274,7 @@ class WaterLayers:
         """Cells by whichever axes they are in."""
         far = data[:, _COLUMN["adcp_range"]]
         down = far * float((self._R_bs @ self._axis) @ down_b)
-        v = data[:, [_COLUMN[name] for name in VELOCITIES]].copy()
-        earth = data[:, [_COLUMN[name] for name in EARTH]]
-        rpy = data[:, [_COLUMN[name] for name in ATTITUDE]]
-        turned = np.isnan(v).any(axis=1) & np.isfinite(earth).all(axis=1) & np.isfinite(rpy).all(axis=1)
-        if turned.any():
-            v[turned] = (earth[turned, None] @ matrix_from_rpy(rpy[turned]))[:, 0]
-        along = data[:, [_COLUMN[name] for name in ALONG]]
+        v, along = in_dvl_axes(data), data[:, [_COLUMN[name] for name in ALONG]]
         if self._geometry is not None and np.isnan(v).all() and np.isfinite(along).any():
             v = by_mapped_beams(along, far, down, self._geometry, self._R_bs.T @ down_b)
         good = np.isfinite(v).all(axis=1)
@@ -329,6 +333,23 @@ class WaterLayers:
         context[:, at.ABOVE_AT], context[:, at.BELOW_AT] = self._places[[knot % K, (knot + (of_next > 0.0)) % K]]
         context[:, at.SHARE], context[:, at.FIRST_KNOT], context[:, at.LAYER_WIDTH] = of_next / total, first, layer
         return out
+
+
+def in_dvl_axes(data: Array) -> Array:
+    """Velocities of n cells, DVL axes; those along Earth's axes by the instrument's attitude; NaN = neither, (n, 3)."""
+    v = data[:, [_COLUMN[name] for name in VELOCITIES]].copy()
+    earth = data[:, [_COLUMN[name] for name in EARTH]]
+    rpy = data[:, [_COLUMN[name] for name in ATTITUDE]]
+    turned = np.isnan(v).any(axis=1) & np.isfinite(earth).all(axis=1) & np.isfinite(rpy).all(axis=1)
+    if turned.any():
+        v[turned] = (earth[turned, None] @ matrix_from_rpy(rpy[turned]))[:, 0]
+    return v
+
+
+def cells_axis(config: Config) -> Array:
+    """The direction from the head to its cells, DVL axes, shape (3,)."""
+    down = mount_matrix(config.dvl.mount_rpy_deg)[2, 2] >= 0.0
+    return np.array([0.0, 0.0, 1.0 if down == (config.water.looks == "down") else -1.0])
 
 
 def _level(imu: Array, time: float) -> Array:

@@ -1,6 +1,6 @@
 """The Doppler velocity log: velocity over ground and through the water."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +21,7 @@ LOCKED = 0.8  # share of pings with bottom lock that is usual
 KNOWN_YAW_SD_DEG = 10.0  # sd of the yaw's prior up to which the mounting determines the direction of the rate's noise
 
 
-def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
+def axes_remedy(H: Array, R_bs: Array, names: Sequence[str] = VELOCITIES) -> tuple[str, str]:
     """Cause and remedy where velocities agree with the IMU once their axes are named otherwise.
 
     Left-handed axes are a mounting after one sign is reversed: the one that leaves the smallest turn.
@@ -30,14 +30,15 @@ def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     ----------
     H : ndarray, shape (3, 3), signed permutation that turns measured velocities into right ones
     R_bs : ndarray, shape (3, 3), mounting as configured, or as it fits
+    names : columns of the velocities
     """
     if np.linalg.det(H) > 0.0:
         return "its mounting is not as configured", f"state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ H)}"
-    named = ["-" * int(row.min() < 0.0) + VELOCITIES[int(np.abs(row).argmax())] for row in H]
+    named = ["-" * int(row.min() < 0.0) + names[int(np.abs(row).argmax())] for row in H]
     wrong = int(np.diagonal(H).argmin())
     turn = H.copy()
     turn[:, wrong] *= -1.0
-    remedy = f"reverse the sign of {VELOCITIES[wrong]}, units: {{{VELOCITIES[wrong]}: -m/s}}"
+    remedy = f"reverse the sign of {names[wrong]}, units: {{{names[wrong]}: -m/s}}"
     if not np.array_equal(turn, np.eye(3)):
         remedy += f", and state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ turn)}"
     return f"its axes are left-handed and should be {', '.join(named)}", remedy

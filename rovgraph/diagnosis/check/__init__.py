@@ -17,10 +17,11 @@ from rovgraph.diagnosis.check import acoustics
 from rovgraph.diagnosis.check.agreement import headings, vertical
 from rovgraph.diagnosis.check.clocks import Examined, bridge_jumps, overlap, presence, regularity, timing
 from rovgraph.diagnosis.check.compasses import body_heading, field_of_place
-from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, profiles, ranges
+from rovgraph.diagnosis.check.dvl import beams, dvl_and_imu, ranges
 from rovgraph.diagnosis.check.findings import Finding, Report, Timing, since
 from rovgraph.diagnosis.check.fixes import current, start, track
 from rovgraph.diagnosis.check.values import angles, frozen_imu, gravity, own, saturated, standstill, turn_rates
+from rovgraph.diagnosis.check.water import profiles
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
 from rovgraph.inference.resolve import convergence, declination_by_place
@@ -186,13 +187,16 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 
 
 def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: Config) -> dict[Check, list[Finding]]:
-    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading, units.
+    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading, units,
+    profiles of the water from the DVL whose head, clock and axes they share.
 
     Nor is bottom lock missed where the beams carry the dive.
     """
     out = dict(found)
     if any(f.kind == "bottom lock" and f.level == "ok" for f in found[beams]):
         out[own] = [f for f in found[own] if f.kind != "bottom lock"]
+    if any(f.kind in ("axes", "lag", "jump") and f.level != "ok" for f in found[dvl_and_imu]):
+        out[profiles] = [f for f in found[profiles] if f.kind not in ("axes", "lag")]
     if any(f.kind == "axes" and f.level != "ok" for f in found[gravity]):
         out[headings] = [f for f in found[headings] if f.kind != "sign" or f.sensor == "mag"]
     if any(f.kind == "unit" for f in found[acoustics.depths]):

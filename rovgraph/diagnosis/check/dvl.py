@@ -6,31 +6,27 @@ The check needs neither heading nor depth.
 from collections.abc import Iterator
 
 import numpy as np
-import pandas as pd
 
 from rovgraph.diagnosis.check.acceleration import BETTER, AccelerationFit, DvlAgainstImu, Search
 from rovgraph.diagnosis.check.agreement import dives_with_depth
 from rovgraph.diagnosis.check.clocks import Examined, compare, find_jump
 from rovgraph.diagnosis.check.findings import Finding, believed_lag, valid_pings
 from rovgraph.diagnosis.check.lags import ORIENTATIONS
-from rovgraph.geometry import Array, log_rotation, matrix_from_rpy
-from rovgraph.log import Log, Stream
+from rovgraph.geometry import Array, log_rotation
+from rovgraph.log import Log
 from rovgraph.log.units import UNITS
 from rovgraph.model.config import Config, beliefs, mount_matrix
 from rovgraph.problem.beams import ENOUGH, ONE_PING_S, PingsByBeams, beam_sensors, head_against_velocity, nearest
 from rovgraph.rules import ACCELERATION, SURE, remedy_of_lag
 from rovgraph.sensors import Level
 from rovgraph.sensors.dvl import LOCKED, axes_remedy
+from rovgraph.sensors.dvl import VELOCITIES as PING
 from rovgraph.sensors.dvl_beam import BEAMS, beam_geometry, beams_of
 from rovgraph.sensors.instruments import instruments
 from rovgraph.sensors.water_layer import CELLS, VELOCITIES
 
-LONGEST_LAG_S, LAG_STEP_S, SLOPE_S = 30.0, 0.5, 1.0  # of profiles against the depth, and over which it changes
 FARTHEST_M = 2000.0  # that a DVL of 38 kHz reaches
 CHANGE_S, CHANGE_M, TOGETHER = 5.0, 0.2, 0.7  # over which range and depth change, by how much, and correlation
-BETTER_LAG = 0.6  # of the error as it stands, that another lag or sign leaves
-BESIDE_S = 1.0  # between a profile and a ping
-AS_BOTTOM_MPS = 0.05  # between cells and bottom track
 SIMILAR = 1.1  # times the least error, up to which two orientations are not distinguished
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 APART = 0.15  # that search and fit may be apart [s]
@@ -42,19 +38,24 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
     compared = compare(log, config) if examined is None else examined.compared
     if compared is None:
         return
-    found = compared.search()
-    if np.isfinite(found.error).sum() == 0:
-        return
     jump = find_jump(log, compared) if examined is None else examined.jump
     if jump is not None:
         yield jump.finding(log)
+    else:
+        yield from beside_imu(log, config, compared)
+
+
+def beside_imu(log: Log, config: Config, compared: DvlAgainstImu, sensor: str = "dvl") -> Iterator[Finding]:
+    """Axes, mounting and clock of velocities that move as the vehicle does, the log's pings; ``sensor`` has them."""
+    found = compared.search()
+    if np.isfinite(found.error).sum() == 0:
         return
-    if (earth := _earth_axes(compared, found)) is not None:
+    if (earth := _earth_axes(compared, found, sensor)) is not None:
         yield earth
         return
     k, m = _explanation(found)
     if found.agreement[k, m] < ACCELERATION.follows:
-        yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
+        yield Finding(sensor, "ok", "too little acceleration to compare its axes and clock with the IMU")
         return
     if k:
         k = _upright(log, config, found, m)
@@ -62,8 +63,9 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
     if fit is None:
         return
     better = found.error[0, found.now] / found.error[k, m]
-    yield _mounting(config, k, fit, f"corrected, its acceleration agrees {better:.1f} times better with the IMU's")
-    yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
+    better = f"corrected, its acceleration agrees {better:.1f} times better with the IMU's"
+    yield _mounting(config, k, fit, better, sensor)
+    yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]), sensor)
 
 
 def beams(log: Log, config: Config) -> Iterator[Finding]:
@@ -151,57 +153,7 @@ def _to_depth(log: Log, mean: Array) -> float | None:
     return float(deeper @ nearer / (deeper @ deeper))
 
 
-def profiles(log: Log, config: Config) -> Iterator[Finding]:
-    """Cells of the water against depth and bottom track: their clock and sign, and a bottom that nothing marks."""
-    if CELLS not in log or "depth" not in log:
-        return
-    cells, depth = log[CELLS], log["depth"]
-    velocity = np.column_stack([cells[name] for name in VELOCITIES])
-    tilt = np.nan_to_num(np.column_stack([cells["adcp_roll"], cells["adcp_pitch"], np.zeros(len(cells))]))
-    logged = np.isfinite(cells["adcp_pitch"])[:, None]
-    down_s = np.where(logged, matrix_from_rpy(tilt)[:, 2], mount_matrix(config.dvl.mount_rpy_deg)[2])
-    sinking = pd.Series((velocity * down_s).sum(axis=1)).groupby(cells.time).median().dropna()
-    time = sinking.index.to_numpy(float)
-    if len(time) < ENOUGH or len(depth) < ENOUGH:
-        return
-    lags = np.arange(-LONGEST_LAG_S, LONGEST_LAG_S + LAG_STEP_S, LAG_STEP_S)
-    at = time - lags[:, None]
-    above, below = (np.interp(at + h, depth.time, depth["depth"]) for h in (-SLOPE_S, SLOPE_S))
-    inside = (at > depth.time[0] + SLOPE_S) & (at < depth.time[-1] - SLOPE_S)
-    apart = np.where(inside, (below - above) / (2.0 * SLOPE_S) - sinking.to_numpy(), np.nan)
-    error, now = np.sqrt(np.nanmean(apart**2, axis=1)), len(lags) // 2
-    best = int(np.nanargmin(error))
-    turned = float(np.sqrt(np.nanmean((apart[now] + 2.0 * sinking.to_numpy()) ** 2)))
-    if turned < BETTER_LAG * error[now]:
-        remedy = "state units: {adcp_velocity: -m/s}"
-        yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
-    elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
-        text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
-        yield Finding(CELLS, "warning", f"{text}: state delay_s.adcp, or correct them", "lag")
-    yield from _unmarked(log, cells, velocity)
-
-
-def _unmarked(log: Log, cells: Stream, velocity: Array) -> Iterator[Finding]:
-    """Whether cells beyond a range move as the bottom does, and neither altitude nor the table marks it."""
-    marked = np.isfinite(cells["adcp_bottom"]).any() or "dvl_altitude" in log
-    pings = valid_pings(log["dvl"]) if "dvl" in log and not marked else None
-    if pings is None or len(pings) < ENOUGH:
-        return
-    near = nearest(pings.time, cells.time)
-    beside = np.abs(pings.time[near] - cells.time) < BESIDE_S
-    off = np.hypot(*(velocity - pings.data[near, :3])[:, :2].T)
-    table = pd.DataFrame({"range": cells["adcp_range"], "off": off})[beside & np.isfinite(off)].groupby("range")["off"]
-    usual = table.median()[table.count() >= ENOUGH]
-    if len(usual) < 3 or not usual.max() > AS_BOTTOM_MPS * 4.0:
-        return
-    with_bottom = usual.to_numpy() < AS_BOTTOM_MPS
-    if with_bottom[-1] and not with_bottom[0]:
-        first = float(usual.index[len(usual) - int(np.argmin(with_bottom[::-1]))])
-        text = f"cells from {first:g} m on move as the bottom does, which is within their range and not marked"
-        yield Finding(CELLS, "warning", f"{text}: give the column bottom, or dvl_altitude")
-
-
-def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
+def _earth_axes(compared: DvlAgainstImu, found: Search, sensor: str) -> Finding | None:
     """Whether the velocities are along Earth's axes."""
     turning, best = compared.turning(), float(found.agreement.max())
     if turning is None or turning.not_at_all < ACCELERATION.follows:
@@ -214,7 +166,7 @@ def _earth_axes(compared: DvlAgainstImu, found: Search) -> Finding | None:
         f"IMU's acceleration (agreement {turning.not_at_all:.2f}, {best:.2f} along the vehicle's): log the DVL's own "
         "axes (instrument or ship coordinates)"
     )
-    return Finding("dvl", "warning", text, "axes")
+    return Finding(sensor, "warning", text, "axes")
 
 
 def _explanation(found: Search) -> tuple[int, int]:
@@ -251,7 +203,7 @@ def _upright(log: Log, config: Config, found: Search, m: int) -> int:
     return int(chosen[int(np.argmin(error[chosen]))])
 
 
-def _mounting(config: Config, k: int, fit: AccelerationFit, better: str) -> Finding:
+def _mounting(config: Config, k: int, fit: AccelerationFit, better: str, sensor: str) -> Finding:
     """Whether the mounting of a fit is that of the configuration."""
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
     turn = log_rotation((fit.R_bs @ (R_bs @ ORIENTATIONS[k]).T)[None])[0]
@@ -260,27 +212,32 @@ def _mounting(config: Config, k: int, fit: AccelerationFit, better: str) -> Find
     turned = bool((np.abs(turn) > np.maximum(TURNED, SURE * np.hypot(fit.turn_sd, believed))).any())
     if k == 0 and not turned:
         return Finding(
-            "dvl", "ok", f"its acceleration agrees with the IMU's, axes as configured (agreement {fit.agreement:.2f})"
+            sensor, "ok", f"its acceleration agrees with the IMU's, axes as configured (agreement {fit.agreement:.2f})"
         )
+    names = VELOCITIES if sensor == CELLS else PING
     if turned and np.linalg.det(fit.R_bs) > 0.0:
-        cause, remedy = axes_remedy(np.eye(3), fit.R_bs)
+        cause, remedy = axes_remedy(np.eye(3), fit.R_bs, names)
         better = "its acceleration shows this" if k == 0 else better
     else:
-        cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
-    return Finding("dvl", "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}", "axes")
+        cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs, names)
+    if sensor == CELLS and "mount_rpy_deg" in remedy:
+        remedy += ", which holds for the DVL's bottom track too; where that is right, turn the velocities of the table"
+    return Finding(sensor, "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}", "axes")
 
 
-def _clock(config: Config, compared: DvlAgainstImu, H: Array, fit: AccelerationFit, coarse: float) -> Finding:
+def _clock(
+    config: Config, compared: DvlAgainstImu, H: Array, fit: AccelerationFit, coarse: float, sensor: str
+) -> Finding:
     """Whether the stamps are late, by the fit and by the search, whose errors are others."""
     believed = believed_lag(config, "dvl")
     late = fit.lag - believed[0]
     sense = "late" if late >= 0.0 else "early"
     text = f"its stamps are {abs(late):.3f} s {sense} relative to the IMU's (sd {fit.lag_sd:.3f} s)"
     if not ACCELERATION.is_late(fit.lag, fit.lag_sd, believed):
-        return Finding("dvl", "ok", text)
+        return Finding(sensor, "ok", text)
     if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - believed[0]) < 0.5 * abs(late):
-        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
+        return Finding(sensor, "ok", f"{text}, but the dive shows this poorly")
     as_stamped = compared.refine(believed[0], H, held=True)
     if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < ACCELERATION.evidence:
-        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
-    return Finding("dvl", "warning", f"{text}: {remedy_of_lag(config, 'dvl', fit.lag, fit.lag_sd)}", "lag")
+        return Finding(sensor, "ok", f"{text}, but the dive shows this poorly")
+    return Finding(sensor, "warning", f"{text}: {remedy_of_lag(config, sensor, fit.lag, fit.lag_sd)}", "lag")
