@@ -28,6 +28,7 @@ from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
 from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
+from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
 from rovgraph.problem.problem import Index
@@ -134,11 +135,29 @@ class Drift:
 
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
+        moved, less = self.shows(closures, self.P)
+        return Drift(self.time, self.mean + moved, self.P - less)
+
+    def shows(self, closures: Sequence[LoopClosure], cross: Array) -> tuple[Array, Array]:
+        """What closures say of d other variables: by how much these move, and by how much less they vary.
+
+        Parameters
+        ----------
+        closures : of this drift
+        cross : ndarray, shape (d, 2 m), covariance with the drift
+
+        Returns
+        -------
+        ndarrays, shapes (d,) and (d, d)
+        """
         H, information = self.between([c.knots for c in closures]), np.zeros((2 * len(closures),) * 2)
         for k, closure in enumerate(closures):
             information[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = closure.information
         pull = np.array([c.pull for c in closures]).ravel()
-        return Drift(self.time, *condition(self.mean, self.P, H, information, pull))
+        column = cross @ H.T
+        gain = column @ np.linalg.inv(np.eye(len(H)) + information @ H @ self.P @ H.T)
+        less = gain @ information @ column.T
+        return gain @ (pull - information @ H @ self.mean), 0.5 * (less + less.T)
 
 
 @dataclass(frozen=True)
@@ -166,8 +185,13 @@ class Crossovers:
             "relief_sd_m": self.relief.sd,
             "relief_length_m": self.relief.length,
             "time_s": [c.time for c in self.crossings],
-            "matched": self._matched(self.crossings),
+            "matched": self.matched,
         }
+
+    @property
+    def matched(self) -> list[bool]:
+        """Of each crossing, whether it was."""
+        return self._matched(self.crossings)
 
     def _matched(self, crossings: Sequence[Crossing]) -> list[bool]:
         knots = {closure.knots for closure in self.closures}
@@ -212,16 +236,8 @@ def with_crossovers(
     beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
-    track, drift = estimate.trajectory, drift_of(estimate)
-    used = bottom.soundings[bottom.soundings["used"] == 1]
-    soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
-    lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
-    around, place = None, beliefs[CHART_PLACE]
-    if chart is not None:
-        drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
-        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
-        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
-    found = match(lines, drift, around)
+    track, place = estimate.trajectory, beliefs[CHART_PLACE]
+    drift, found = matched(estimate, bottom, beliefs, chart, origin)
     left = drift.given(found.closures) if found.closures else drift
     if chart is not None:
         shown = {CHART_PLACE: left.P[-2:, -2:]} if place.estimate else {}
@@ -242,6 +258,29 @@ def with_crossovers(
             cov_p[:, i, j] -= np.interp(track.time, left.time, np.diagonal(less[i::2, j::2]))
     corrected = replace(track, p_n=p_n, v_n=v_n, cov_p=cov_p)
     return replace(estimate, trajectory=corrected, posterior=None), found
+
+
+def matched(
+    estimate: Estimate, bottom: Bottom, beliefs: Mapping[str, Belief], chart: ChartFile | None, origin: Origin
+) -> tuple[Drift, Crossovers]:
+    """The drift of a smoothed track, and what its soundings show of it; parameters of `with_crossovers`.
+
+    With a chart, the last knot of the drift is that of the chart.
+    """
+    track, drift, lines = estimate.trajectory, drift_of(estimate), lines_over(estimate.trajectory, bottom)
+    around, place = None, beliefs[CHART_PLACE]
+    if chart is not None:
+        drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
+        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
+        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
+    return drift, match(lines, drift, around)
+
+
+def lines_over(track: Trajectory, bottom: Bottom) -> list[Line]:
+    """The straight parts of a track, with the soundings under it."""
+    used = bottom.soundings[bottom.soundings["used"] == 1]
+    soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
+    return lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
 
 
 def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) -> Crossovers:
