@@ -52,7 +52,7 @@ class Crossed:
 
     Attributes
     ----------
-    text : one line for people
+    text : for people
     known : the newest keyframe, by what was matched, too; None where nothing was
     places : of the crossings that were looked at
     quiet : nothing to tell, as long as nothing was matched before
@@ -149,7 +149,7 @@ def _untrusted(verdict: Verdict) -> Crossed:
 
 
 def _refused(why: str) -> Crossed:
-    return Crossed(f"crossovers: nothing is used: {why}")
+    return Crossed(f"nothing is used: {why}")
 
 
 def _horizontal_sd(known: Gaussian) -> float:
@@ -224,4 +224,4 @@ class LiveCrossovers:
         before, self.used = self.used, crossed.known is not None
         news = self.used or before or not (crossed.quiet or crossed.text in self._told)
         self._told.add(crossed.text)
-        return ("matched" if self.used else "unused", crossed.text) if news else None
+        return ("matched" if self.used else "unused", crossed.text.removeprefix("crossovers: ")) if news else None
