@@ -27,7 +27,7 @@ from scipy.stats import chi2
 
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
-from rovgraph.inference.crossovers import Drift, field_at, match
+from rovgraph.inference.crossovers import BEAMS_M, Drift, field_at, match
 from rovgraph.inference.relief import Line, lines_of
 
 KNOT_S = 20.0
@@ -264,7 +264,8 @@ def draw(case: Case, seed: int) -> Survey:
     if case.fish:
         inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
         depth -= inside[:, None] * (2.0 if case.dense else rng.uniform(0.0, 4.0, depth.shape))
-    place = (p - error)[:, None] + arm
+    beams = np.repeat(np.random.default_rng([47, seed]).normal(0.0, BEAMS_M, (len(t) // 60 + 1, 2)), 60, axis=0)
+    place = (p - error + beams[: len(t)])[:, None] + arm
     heading = np.arctan2(way[:, 1], way[:, 0])
     lines = lines_of(t, heading, p - error, np.repeat(t, len(signs)), place.reshape(-1, 2), depth.ravel())
     drift, chart = Drift(knots, np.zeros(len(P)), P), None
@@ -308,7 +309,7 @@ def survey(case: Case, seed: int) -> Outcome:
         each = [(left[own], after.P[own, own]) for own in (slice(2 * k, 2 * k + 2) for k in range(1, len(drawn.knots)))]
         nees = float(np.mean([x @ np.linalg.solve(C, x) / 2 for x, C in each]))
         H, off_chart = (
-            after.between([c.knots for c in found.closures]),
+            after.between([c.times for c in found.closures]),
             np.append(left, np.zeros(len(after.mean) - len(e))),
         )
         for k in range(0, len(H), 2):
@@ -338,7 +339,7 @@ def draw_figure(path: str, case: Case, seed: int) -> None:
     left.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
     left.legend(loc="upper right", fontsize=8)
     crossing = found.crossings[-5]
-    true = drawn.error[[np.abs(drawn.time - drawn.knots[k]).argmin() for k in crossing.knots]]
+    true = drawn.error[[np.abs(drawn.time - time).argmin() for time in crossing.times]]
     axis = np.arange(-30.0, 30.5, 0.5)
     shifts = true[0] - true[1] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
     L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))[0]

@@ -23,7 +23,7 @@ from live import flown
 import rovgraph as rg
 from rovgraph.inference.crossovers import Drift, Field, crossings_of
 from rovgraph.inference.relief import Relief
-from rovgraph.lab.crosslines import _crossing_times, _matched, _swath, _worth, plan_crosslines
+from rovgraph.lab.crosslines import _matched, _swath, _worth, plan_crosslines
 from rovgraph.report.lab import crosslines_in_words
 
 RELIEF = Relief(0.35, 4.5, 0.1, np.inf)
@@ -115,7 +115,7 @@ def test_crossings_show_no_rotation_of_the_survey_however_many():
     way = np.gradient(p, axis=0)
     t = np.arange(len(p), dtype=float)
     lines = _swath(t, np.arctan2(way[:, 1], way[:, 0]), p, 4.0)
-    knots = np.unique(np.round([*t[::10], *_crossing_times(lines)]))
+    knots = np.unique(np.round([*t[::10], *(line.centre[0][k] for line in lines for k in (0, -1))]))
     place = np.stack([np.interp(knots, t, axis) for axis in p.T], axis=-1)
     turned = angle * np.stack([-place[:, 1], place[:, 0]], axis=-1).ravel()
     walk = 1e-3 * np.kron(np.minimum.outer(knots, knots) + 1e-2, np.eye(2))

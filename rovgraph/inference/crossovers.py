@@ -13,7 +13,7 @@ crossing splits it into one for every peak of its field, and one in which its so
 what all hypotheses within `LEAD` of the best agree about.
 
 What a field says of a shift, beside the track and the other crossings, is found from moments about its peak
-(expectation propagation, Minka 2001), not from its curvature there: the noise of a loop closure between two knots.
+(expectation propagation, Minka 2001), not from its curvature there: the noise of a loop closure between two times.
 
 Rotation and scale of the whole track leave no shift where it crosses itself: crossovers cannot see them.
 """
@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom
@@ -34,7 +35,7 @@ from rovgraph.model.origin import Origin
 from rovgraph.problem.problem import Index
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
-JITTER_M = 0.25  # sd of a shift beside the drift at knots: what it does between them, errors of beams and attitude
+BEAMS_M = 0.1  # sd of where soundings are, beside the track's error, where it is not known: 0.5 degrees at 10 m
 PIECE_M, CHART_PIECE_M = 25.0, 50.0  # of a line that is run again, or on a chart, matched by itself
 ON_CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
@@ -60,32 +61,39 @@ class Crossing:
     Attributes
     ----------
     line, earlier : numbers of the lines, `ON_CHART` of the chart
-    knots : when it was there, of `Drift`
+    times : of both there, inf of the chart [s]
     centre : ndarray, shape (2,), north and east of the earlier line, or of the piece [m]
-    time : of the later line there [s]
     """
 
     line: int
     earlier: int
-    knots: tuple[int, int]
+    times: tuple[float, float]
     centre: Array
-    time: float
+
+    def beams_variance(self, sd: float) -> float:
+        """Of its shift, by where soundings are: those of one line, or of two [m^2]."""
+        return sd**2 if self.earlier == ON_CHART else 2.0 * sd**2
 
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """What soundings say of the errors of a track at two knots, in information form.
+    """What soundings say of the errors of a track at two times, in information form.
 
     Attributes
     ----------
-    knots : a, b
+    times : a, b [s]
     information : ndarray, shape (2, 2), of e(a) - e(b) [1/m^2]
     pull : ndarray, shape (2,), information times shift [1/m]
     """
 
-    knots: tuple[int, int]
+    times: tuple[float, float]
     information: Array
     pull: Array
+
+    def with_noise(self, variance: float) -> "LoopClosure":
+        """Where the shift that soundings see has a noise of its own beside the errors [m^2]."""
+        share = np.linalg.inv(np.eye(2) + variance * self.information)
+        return replace(self, information=share @ self.information, pull=share @ self.pull)
 
 
 def condition(mean: Array, P: Array, H: Array, information: Array, pull: Array) -> tuple[Array, Array]:
@@ -98,45 +106,41 @@ def condition(mean: Array, P: Array, H: Array, information: Array, pull: Array) 
 
 @dataclass(frozen=True)
 class Drift:
-    """Errors of a track at m knots, north and east.
+    """Errors of a track at m knots, north and east, and between them, where it is straight, in proportion.
 
     Attributes
     ----------
     time : ndarray, shape (m,) [s]
     mean : ndarray, shape (2 m,) [m]
     P : ndarray, shape (2 m, 2 m) [m^2]
+    beams_sd : of where soundings are beside these errors, by attitude and mounting of the beams, along any axis [m]
     """
 
     time: Array
     mean: Array
     P: Array
+    beams_sd: float = BEAMS_M
 
     def beside(self, mean: Array, sd: float) -> "Drift":
-        """With one more knot, never reached: the error of a chart's place, north and east."""
+        """With one more knot, at no time: the error of a chart's place, north and east."""
         P = np.pad(self.P, (0, 2))
         P[-2:, -2:] = sd**2 * np.eye(2)
-        return Drift(np.append(self.time, np.inf), np.append(self.mean, mean), P)
-
-    def knot(self, time: float) -> int:
-        """The one next to a time."""
-        return int(np.abs(self.time - time).argmin())
+        return replace(self, time=np.append(self.time, np.inf), mean=np.append(self.mean, mean), P=P)
 
     def at(self, time: Array) -> Array:
         """The mean at some times, shape (n, 2) [m]."""
         return np.stack([np.interp(time, self.time, axis) for axis in self.mean.reshape(-1, 2).T], axis=-1)
 
-    def between(self, ends: Sequence[tuple[int, int]]) -> Array:
-        """Derivative of k shifts, each between two knots, by the drift, shape (2 k, 2 m)."""
-        H = np.zeros((len(ends), len(self.time)))
-        for row, (a, b) in zip(H, ends, strict=True):
-            row[a] += 1.0
-            row[b] -= 1.0
-        return np.asarray(np.kron(H, np.eye(2)), float)
+    def between(self, ends: Sequence[tuple[float, float]]) -> Array:
+        """Derivative of k shifts, each between two times, by the drift, shape (2 k, 2 m)."""
+        later, earlier = np.array(ends).T
+        H = [np.interp(later, self.time, knot) - np.interp(earlier, self.time, knot) for knot in np.eye(len(self.time))]
+        return np.asarray(np.kron(np.transpose(H), np.eye(2)), float)
 
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
         moved, less = self.shows(closures, self.P)
-        return Drift(self.time, self.mean + moved, self.P - less)
+        return replace(self, mean=self.mean + moved, P=self.P - less)
 
     def shows(self, closures: Sequence[LoopClosure], cross: Array) -> tuple[Array, Array]:
         """What closures say of d other variables: by how much these move, and by how much less they vary.
@@ -150,7 +154,7 @@ class Drift:
         -------
         ndarrays, shapes (d,) and (d, d)
         """
-        H, information = self.between([c.knots for c in closures]), np.zeros((2 * len(closures),) * 2)
+        H, information = self.between([c.times for c in closures]), np.zeros((2 * len(closures),) * 2)
         for k, closure in enumerate(closures):
             information[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = closure.information
         pull = np.array([c.pull for c in closures]).ravel()
@@ -184,7 +188,7 @@ class Crossovers:
         return {
             "relief_sd_m": self.relief.sd,
             "relief_length_m": self.relief.length,
-            "time_s": [c.time for c in self.crossings],
+            "time_s": [c.times[0] for c in self.crossings],
             "matched": self.matched,
         }
 
@@ -194,8 +198,8 @@ class Crossovers:
         return self._matched(self.crossings)
 
     def _matched(self, crossings: Sequence[Crossing]) -> list[bool]:
-        knots = {closure.knots for closure in self.closures}
-        return [c.knots in knots for c in crossings]
+        matched = {closure.times for closure in self.closures}
+        return [c.times in matched for c in crossings]
 
     @property
     def text(self) -> str:
@@ -211,13 +215,14 @@ class Crossovers:
         return f"crossovers: {' and '.join(counts)} matched, by {relief}{chart}"
 
 
-def drift_of(estimate: Estimate, also: Sequence[float] = ()) -> Drift:
-    """Errors of a smoothed track at its knots and at some more times, by its joint covariance."""
+def drift_of(estimate: Estimate, lines: Sequence[Line]) -> Drift:
+    """Errors of a smoothed track at its knots, the ends of lines among them, by its joint covariance."""
     track, posterior = estimate.trajectory, estimate.posterior
     assert posterior is not None
     apart = max(KNOT_S, (track.time[-1] - track.time[0]) / KNOTS)
     times = np.append(np.arange(track.time[0], track.time[-1], apart), track.time[-1])
-    keyframes = np.unique(np.searchsorted(track.time, [*times, *also]).clip(max=len(track) - 1))
+    ends = [end for line in lines for end in line.centre[0][[0, -1]]]
+    keyframes = np.unique(np.searchsorted(track.time, [*times, *ends]).clip(max=len(track) - 1))
     return Drift(track.time[keyframes], np.zeros(2 * len(keyframes)), posterior.horizontal(keyframes.tolist()))
 
 
@@ -244,7 +249,7 @@ def with_crossovers(
         values = {CHART_PLACE: left.mean[-2:] if place.estimate else place.mean}
         rows = calibration_estimates({CHART_PLACE: place}, [CHART], values, shown)
         estimate = replace(estimate, calibration=[*estimate.calibration, *rows])
-        drift, left = (Drift(d.time[:-1], d.mean[:-2], d.P[:-2, :-2]) for d in (drift, left))
+        drift, left = (replace(d, time=d.time[:-1], mean=d.mean[:-2], P=d.P[:-2, :-2]) for d in (drift, left))
     if not found.closures:
         return estimate, found
     moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
@@ -267,7 +272,8 @@ def matched(
 
     With a chart, the last knot of the drift is that of the chart.
     """
-    track, drift, lines = estimate.trajectory, drift_of(estimate), lines_over(estimate.trajectory, bottom)
+    track, lines = estimate.trajectory, lines_over(estimate.trajectory, bottom)
+    drift = replace(drift_of(estimate, lines), beams_sd=_beams_sd(bottom, track))
     around, place = None, beliefs[CHART_PLACE]
     if chart is not None:
         drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
@@ -278,9 +284,21 @@ def matched(
 
 def lines_over(track: Trajectory, bottom: Bottom) -> list[Line]:
     """The straight parts of a track, with the soundings under it."""
-    used = bottom.soundings[bottom.soundings["used"] == 1]
+    used = _used(bottom)
     soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     return lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
+
+
+def _used(bottom: Bottom) -> pd.DataFrame:
+    return bottom.soundings[bottom.soundings["used"] == 1]
+
+
+def _beams_sd(bottom: Bottom, track: Trajectory) -> float:
+    """Of where soundings are beside the track's error."""
+    soundings = _used(bottom)
+    variance = soundings["north_sd"] ** 2 + soundings["east_sd"] ** 2
+    error = np.interp(soundings["time"], track.time, track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
+    return float(np.sqrt(np.median(np.maximum(variance - error, 0.0)) / 2.0))
 
 
 def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) -> Crossovers:
@@ -297,7 +315,7 @@ def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) 
     if chart is not None and lines:
         off = chart.refused(np.concatenate([x.place for x in lines]), np.concatenate([x.depth for x in lines]))
     known = None if chart is None or off else chart.smoothed(relief)
-    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k, drift)] if known is not None else []
+    pieces = [c for k in range(len(lines)) for c in pieces_of(lines, k)] if known is not None else []
     for _ in range(ROUNDS):
         crossings = pieces + [c for k in range(1, len(lines)) for c in crossings_of(lines, k, track)]
         closures, refused = _match(lines, crossings, drift, relief, known)
@@ -321,7 +339,11 @@ def _match(
     best = hypotheses[0]
     likely = np.array([h.mean for h in hypotheses if h.score > best.score - LEAD]).reshape(-1, len(crossings), 2)
     spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
-    closures = [closure for k, closure in best.closures.items() if spread[k] < SAME_M]
+    closures = [
+        closure.with_noise(crossings[k].beams_variance(drift.beams_sd))
+        for k, closure in best.closures.items()
+        if spread[k] < SAME_M
+    ]
     gates = (
         (repetition(lines, 2.0 * reach) > REPEATS, "the bottom repeats itself, as sand waves do"),
         (best.score < LEAD, "soundings of its lines do not match"),
@@ -354,16 +376,16 @@ def crossings_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
             for own in np.array_split(np.arange(first, last), pieces):
                 a = own[least[own].argmin()] if pieces == 1 else own[len(own) // 2]
                 b = int(apart[a].argmin())
-                out.append(Crossing(k, j, (drift.knot(t[a]), drift.knot(t_b[b])), own_b[b], float(t[a])))
+                out.append(Crossing(k, j, (float(t[a]), float(t_b[b])), own_b[b]))
     return out
 
 
-def pieces_of(lines: Sequence[Line], k: int, drift: Drift) -> list[Crossing]:
+def pieces_of(lines: Sequence[Line], k: int) -> list[Crossing]:
     """Pieces of a line that are on a chart."""
     t, p, _ = lines[k].centre
     count = max(round(len(t) * CELL_M / CHART_PIECE_M), 1)
     middle = [own[len(own) // 2] for own in np.array_split(np.arange(len(t)), count)]
-    return [Crossing(k, ON_CHART, (drift.knot(t[a]), len(drift.time) - 1), p[a], float(t[a])) for a in middle]
+    return [Crossing(k, ON_CHART, (float(t[a]), np.inf), p[a]) for a in middle]
 
 
 class Field:
@@ -478,13 +500,13 @@ class Hypothesis:
         return cells, (off @ np.linalg.inv(V) * off).sum(axis=-1)
 
     def branches(
-        self, k: int, knots: tuple[int, int], places: Array, L: Array, misfit: Array, far: Array
+        self, k: int, times: tuple[float, float], places: Array, L: Array, misfit: Array, far: Array
     ) -> "list[Hypothesis]":
         """One for each peak of a field times what is predicted, and one in which its soundings are not the bottom's.
 
         Parameters
         ----------
-        k, knots : the crossing
+        k, times : the crossing
         places : ndarray, shape (n, n, 2), shifts [m]
         L, misfit, far : ndarray, shape (n, n), the field there (-inf where it is not known), its squared residuals, and
             squared distances from what is predicted [sd^2]
@@ -515,7 +537,7 @@ class Hypothesis:
             value, axes = np.linalg.eigh(np.linalg.inv(spread[j]) - before)
             information = (axes * np.maximum(value, 0.0)) @ axes.T
             pull = information @ m + (information + before) @ (place[j] - m)
-            closures = {**self.closures, k: LoopClosure(knots, information, pull)}
+            closures = {**self.closures, k: LoopClosure(times, information, pull)}
             also = (*self.misfits, float(misfits[j])) if shown[j] > SHOWS else self.misfits
             moved = condition(self.mean, self.P, H, information, pull)
             out.append(Hypothesis(*moved, float(score[j]), closures, self.seen + 1, also))
@@ -530,8 +552,9 @@ def associate(
     Next comes the crossing that the best hypothesis predicts best.
     """
     step = float(np.clip(GRID * relief.length, *STEPS_M))
-    H = drift.between([c.knots for c in crossings])
-    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)))
+    H = drift.between([c.times for c in crossings])
+    beams = np.repeat([c.beams_variance(drift.beams_sd) for c in crossings], 2)
+    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + np.diag(beams))
     hypotheses, widest, left = [prior], 0.0, set(range(len(crossings)))
     while left:
         k = min(left, key=lambda k: hypotheses[0].sd[k])
@@ -555,7 +578,7 @@ def associate(
             L[own], misfit[own] = values[:, first : first + own.sum()]
             first += int(own.sum())
             shifts = np.asarray(step * places, float)
-            branches += hypothesis.branches(k, crossings[k].knots, shifts, L, misfit, distance2)
+            branches += hypothesis.branches(k, crossings[k].times, shifts, L, misfit, distance2)
         hypotheses = _pruned(branches)
     return hypotheses, widest
 

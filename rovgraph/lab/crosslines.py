@@ -20,7 +20,6 @@ from rovgraph.inference.crossovers import (
     BESIDE_M,
     ENOUGH,
     FARTHEST_M,
-    JITTER_M,
     SIGMAS,
     Crossing,
     Drift,
@@ -120,9 +119,8 @@ def plan_crosslines(
         raise InputError(f"{log.source}: crosslines are planned for dives without {' and '.join(shown) or 'places'}")
     lines, relief_there = _lines_and_relief(log, config, first, relief)
     grid = _Grid.of(log.source, lines)
-    recorded = _Driven(
-        drift_of(first, _crossing_times(lines)), lines, [None] * len(lines), first.trajectory, relief_there
-    ).crossed([])
+    drift, none = drift_of(first, lines), [None] * len(lines)
+    recorded = _Driven(drift, lines, none, first.trajectory, relief_there).crossed([])
     ranked = [recorded]
     if relief_there.shows:
         sources = tuple(SENSORS[s].heading_source for s in HEADING_STREAMS if s in dive.initial.streams)
@@ -299,7 +297,7 @@ class _Driven:
         track = estimate.trajectory
         lines = _swath(track.time, track.rpy[:, 2], track.p_n[:, :2], grid.half_width)
         which = [grid.crossline_at(float(line.time.mean())) for line in lines]
-        return _Driven(drift_of(estimate, _crossing_times(lines)), lines, which, track, relief, grid)
+        return _Driven(drift_of(estimate, lines), lines, which, track, relief, grid)
 
     @cached_property
     def crossings(self) -> list[tuple[Crossing, Array]]:
@@ -325,15 +323,6 @@ class _Driven:
         return Crossed(grid.along[order], grid.crosslines[order], len(closures), *_sds(P, place))
 
 
-def _crossing_times(lines: Sequence[Line]) -> list[float]:
-    """When lines are where they cross: knots beside them would make a shift of a rotation, and show it."""
-    still, times = Drift(np.zeros(1), np.zeros(2), np.zeros((2, 2))), list[float]()
-    for crossing in (c for k in range(1, len(lines)) for c in crossings_of(lines, k, still)):
-        t, place, _ = lines[crossing.earlier].centre
-        times += [crossing.time, float(t[np.linalg.norm(place - crossing.centre, axis=1).argmin()])]
-    return times
-
-
 def _worth(lines: Sequence[Line], crossing: Crossing, relief: Relief) -> Array:
     """Information of a crossing's soundings on its shift, shape (2, 2) [1/m^2]."""
     field = field_at(lines, crossing, np.zeros(2), BESIDE_M, relief, None)
@@ -345,8 +334,9 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
     """Loop closures of the crossings that come within the range of the search, in the order in which they do."""
     if len(crossings) < ENOUGH:
         return []
-    H = drift.between([c.knots for c, _ in crossings])
-    P, mean = H @ drift.P @ H.T + JITTER_M**2 * np.eye(len(H)), np.zeros(len(H))
+    H = drift.between([c.times for c, _ in crossings])
+    beams = [c.beams_variance(drift.beams_sd) for c, _ in crossings]
+    P, mean = H @ drift.P @ H.T + np.diag(np.repeat(beams, 2)), np.zeros(len(H))
     left, closures = [*range(len(crossings))], list[LoopClosure]()
     while left:
         reach = [SIGMAS * float(np.sqrt(np.linalg.eigvalsh(P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])[-1])) for k in left]
@@ -355,8 +345,7 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
             break
         crossing, J = crossings[k]
         P = condition(mean, P, np.eye(2, len(H), 2 * k), J, np.zeros(2))[1]
-        beside = J @ np.linalg.inv(np.eye(2) + JITTER_M**2 * J)
-        closures.append(LoopClosure(crossing.knots, beside, np.zeros(2)))
+        closures.append(LoopClosure(crossing.times, J, np.zeros(2)).with_noise(beams[k]))
     return closures if len(closures) >= ENOUGH else []
 
 

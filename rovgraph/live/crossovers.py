@@ -101,7 +101,7 @@ class Survey:
         bottom = bottom_of(self._log, initial.config, Estimate("filtered", track, rows, {}, residual_frame()))
         if bottom is None:
             return _refused(NO_RANGES)
-        lines, still = lines_over(track, bottom), Drift(track.time, np.zeros(2 * len(track)), np.empty((0, 0)))
+        lines, still = lines_over(track, bottom), Drift(track.time[[0, -1]], np.zeros(4), np.zeros((4, 4)))
         enough = sum(len(crossings_of(lines, k, still)) for k in range(1, len(lines))) >= ENOUGH
         return None if enough else Crossed("", quiet=True)
 
@@ -163,8 +163,7 @@ def _places(found: Crossovers, left: Drift) -> tuple[CrossingPlace, ...]:
     out = []
     for crossing, was_matched in zip(found.crossings, found.matched, strict=True):
         of_chart = crossing.earlier == ON_CHART
-        time = crossing.time if of_chart else left.time[crossing.knots[1]]
-        north, east = crossing.centre + left.at(np.array([time]))[0]
+        north, east = crossing.centre + left.at(np.array([crossing.times[0 if of_chart else 1]]))[0]
         out.append(CrossingPlace(float(north), float(east), was_matched, of_chart))
     return tuple(out)
 
