@@ -152,6 +152,9 @@ def _refused(why: str) -> Crossed:
     return Crossed(f"nothing is used: {why}")
 
 
+NOT_COMPUTED = _refused("the smoothed dive does not determine its joint covariance")
+
+
 def _horizontal_sd(known: Gaussian) -> float:
     """Of north and east together [m]."""
     R_nb = known.x[:9].reshape(3, 3)
@@ -200,7 +203,7 @@ class LiveCrossovers:
         x, time = snapshot.known.x, snapshot.time
         here = time, float(np.arctan2(x[3], x[0])), float(x[9]), float(x[10])
         if self._chart is not None and self._track:
-            self._way += float(np.hypot(here[2] - self._track[-1][2], here[3] - self._track[-1][3]))
+            self._way += float(np.hypot(x[12], x[13])) * (time - self._track[-1][0])  # a match moves it, too
         self._track.append(here)
         if time < self._look:
             return

@@ -27,7 +27,7 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.score_test import as_chain
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.live.crossovers import Crossed, LiveCrossovers, Survey
+from rovgraph.live.crossovers import NOT_COMPUTED, Crossed, LiveCrossovers, Survey
 from rovgraph.model.origin import Origin
 from rovgraph.model.state import BIAS, COLUMNS, VELOCITY
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -213,7 +213,9 @@ def _smoothed(
     known, best = reinitialised(engine, dive, states)
     shown = _shown(best, engine.initial, before, dvl_contradicted)
     if survey is not None and crossed is None:
-        crossed = survey.match(engine, best, shown)
+        crossed = NOT_COMPUTED
+        with suppress(InputError, np.linalg.LinAlgError):
+            crossed = survey.match(engine, best, shown)
     return crossed, (known if crossed is None or crossed.known is None else crossed.known, shown, best)
 
 
