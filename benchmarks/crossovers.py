@@ -432,15 +432,17 @@ def print_dives(row: str, seeds: range, small: bool, gyro_scale: float, online: 
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
             got = run_dive(replace(made, configuration=config), online, inspect)
-            seconds, said = time.perf_counter() - begin, "; ".join(line for line in got.said if "crossovers:" in line)
+            seconds, said = time.perf_counter() - begin, [line for line in got.said if "crossovers:" in line]
             ways = {"smooth": [got.rms["smoothed"], got.found["shape"], got.sd["smoothed"]]}
             ways["smooth"].append(got.nees["smoothed"]["position"])
             for kind, command in (("smoothed", "smooth"), ("online", "online")) if online else ():
                 ways[f"{command}, end"] = [got.found[f"{kind} {name}"] for name in ("rms", "sd", "nees")]
             for way, numbers in ways.items():
                 cells = " | ".join(f"{number:.2f}" for number in numbers)
-                verdict, how = got.verdicts[way.partition(",")[0]], "with" if crossovers else "without"
-                print(f"| {row} {seed} | {how} | {way} | {cells} | {seconds:.0f} | {verdict} | {said} |", flush=True)
+                live, verdict = way.startswith("online"), got.verdicts[way.partition(",")[0]]
+                text = "; ".join([line for line in said if line.startswith("online") == live][-1:])
+                how = "with" if crossovers else "without"
+                print(f"| {row} {seed} | {how} | {way} | {cells} | {seconds:.0f} | {verdict} | {text} |", flush=True)
 
 
 def main() -> None:

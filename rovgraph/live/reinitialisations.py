@@ -204,7 +204,7 @@ def _smoothed(
 
     Returns
     -------
-    what crossovers say; the keyframe, what is shown, and the smoothed dive, None where it was not smoothed
+    what crossovers say; the keyframe, what is shown, and the smoothed dive, None where the filter goes on as it is
     """
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
     crossed = None if survey is None else survey.refused(engine.initial, dive, states)
@@ -216,6 +216,8 @@ def _smoothed(
         crossed = NOT_COMPUTED
         with suppress(InputError, np.linalg.LinAlgError):
             crossed = survey.match(engine, best, shown)
+        if not due and not survey.used and crossed.known is None:
+            return crossed, None
     return crossed, (known if crossed is None or crossed.known is None else crossed.known, shown, best)
 
 
