@@ -22,7 +22,8 @@ from fault_campaign.instruments import sample
 from fault_campaign.judge import Dive, nees, run_dive, settled_rows, tracks
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
-from scipy.ndimage import map_coordinates
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.stats import chi2
 
 from rovgraph.geometry import Array
@@ -101,6 +102,16 @@ def waves(rng: np.random.Generator) -> Terrain:
     return Terrain(20.0 + 0.5 * np.sin(2.0 * np.pi * x / length + rng.uniform(0.0, 6.28)))
 
 
+def smooth_relief(rng: np.random.Generator) -> Terrain:
+    """Much smoother than the covariance that is fitted."""
+    return Terrain(20.0 + spectrum(rng, SHAPE, 0.35, lambda k: np.exp(-((k * 5.0) ** 2))))
+
+
+def rough_relief(rng: np.random.Generator) -> Terrain:
+    """Much rougher: an exponential covariance."""
+    return Terrain(20.0 + spectrum(rng, SHAPE, 0.35, lambda k: (1.0 / 10.0**2 + k**2) ** -1.5))
+
+
 def other_relief(rng: np.random.Generator) -> Terrain:
     """Relief that no Matern describes: ridges on one half, boulders on the other, a smooth swell."""
     swell = spectrum(rng, SHAPE, 0.4, lambda k: np.exp(-((k * 20.0) ** 2)))
@@ -119,7 +130,8 @@ class Drifting:
     heading, deviation : constants [deg]; scale
     wander, wander_s : [deg, s]
     velocity : white, of the speed over ground [m/s/rtHz]
-    start : of the first place [m]
+    start : of the first place of a dive [m]
+    common : correlation of the constants of two dives
     """
 
     heading: float = 0.0
@@ -129,11 +141,12 @@ class Drifting:
     wander_s: float = 900.0
     velocity: float = 0.005
     start: float = 0.1
+    common: float = 0.5
 
-    def covariance(self, p: Array) -> Array:
-        """Of north and east at every `KNOT_S`-th place, shape (2 m, 2 m)."""
-        d = np.diff(p[:: int(KNOT_S)], axis=0)
-        m = len(d)
+    def covariance(self, t: Array, p: Array, dive: Array) -> Array:
+        """Of north and east at m knots, shape (2 m, 2 m), by their times, places, shape (m, 2), and dives."""
+        d, m = np.diff(p, axis=0) * (np.diff(dive) == 0)[:, None], len(p) - 1
+        same, own = dive[:, None] == dive, dive[1:, None] == dive[1:]
         turned, psi = np.stack([-d[:, 1], d[:, 0]], axis=-1), np.arctan2(d[:, 1], d[:, 0])
         constants = [
             np.deg2rad(self.heading) * turned,
@@ -141,15 +154,14 @@ class Drifting:
             np.deg2rad(self.deviation) * turned * np.cos(psi)[:, None],
             self.scale * d,
         ]
-        t = KNOT_S * np.arange(m)
-        K = np.deg2rad(self.wander) ** 2 * np.exp(-np.abs(t[:, None] - t) / self.wander_s)
+        K = np.deg2rad(self.wander) ** 2 * np.exp(-np.abs(t[:-1, None] - t[:-1]) / self.wander_s)
         steps = np.einsum("ia,ij,jb->iajb", turned, K, turned).reshape(2 * m, 2 * m)
-        steps += sum(np.outer(c.ravel(), c.ravel()) for c in constants)
+        alike = np.kron(np.where(own, 1.0, self.common), np.ones((2, 2)))
+        for c in constants:
+            steps += alike * np.outer(c.ravel(), c.ravel())
         steps += self.velocity**2 * KNOT_S * np.eye(2 * m)
-        total = np.kron(np.tril(np.ones((m, m))), np.eye(2))
-        P = np.zeros((2 * m + 2, 2 * m + 2))
-        P[2:, 2:] = total @ steps @ total.T
-        return P + self.start**2 * np.kron(np.ones((m + 1, m + 1)), np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
+        total = np.kron(np.tril(np.ones((m + 1, m)), -1) * same[:, 1:], np.eye(2))
+        return total @ steps @ total.T + self.start**2 * np.kron(same, np.eye(2)) + 1e-6 * np.eye(2 * m + 2)
 
 
 MTI = Drifting(heading=0.5, deviation=0.5, scale=0.003)
@@ -163,27 +175,58 @@ LOST = Drifting(start=50.0)
 
 @dataclass
 class Case:
-    """A row of the table."""
+    """A row of the table.
+
+    Attributes
+    ----------
+    drift, terrain : of the track, and of the bottom
+    noise : of a sounding [m]
+    tide : amplitude [m], with a period of 10 000 s
+    steep : sd of what the zero of depth does in each of 5 minutes, over the way [m/m]
+    late : of the depth of a vehicle that follows the bottom [s]
+    fish : share of the time, or a school as dense as a bottom
+    altimeter : one beam
+    size : lines, their length, how far they are apart, crosslines
+    chart : what is wrong with it, or "right"
+    again : crosslines of a second dive, so long after
+    """
 
     drift: Drifting = field(default_factory=lambda: WANDER)
     terrain: Callable[[np.random.Generator], Terrain] = matern
     noise: float = 0.14
     tide: float = 0.0
+    steep: float = 0.0
+    late: float = 0.0
     fish: float = 0.0
     dense: bool = False
     altimeter: bool = False
     size: tuple[int, float, float, int] = (12, 500.0, 25.0, 4)
     chart: str | None = None
+    again: int = 0
+    after_s: float = 15_000.0
 
     @cached_property
-    def _covariance(self) -> tuple[Array, Array]:
-        P = self.drift.covariance(path(*self.size))
-        return P, np.linalg.cholesky(P)
+    def way(self) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Time and place, every second, shapes (n,), (n, 2), and which of them are knots."""
+        dives = [path(*self.size)]
+        if self.again:
+            length, width = self.size[1], (self.size[0] - 1) * self.size[2]
+            across = path(self.again, width + 50.0, length / self.again, 0)[:, ::-1]
+            dives.append(across + np.array([0.5 * length / self.again, -25.0]))
+        t, knots, first = [], [], 0
+        for dive in range(len(dives)):
+            own = np.arange(first, first := first + len(dives[dive]))
+            t.append(own + dive * self.after_s)
+            knots.append(np.append(own[: -1 : int(KNOT_S)], own[-1]))
+        return np.concatenate(t), np.concatenate(dives), np.concatenate(knots)
 
-    def errors(self, count: int) -> tuple[Array, Array]:
-        """Covariance of the track at so many knots, and its root."""
-        P, root = self._covariance
-        return P[: 2 * count, : 2 * count], root[: 2 * count, : 2 * count]
+    @cached_property
+    def covariance(self) -> tuple[Array, Array]:
+        """Of the track at its knots, and its root."""
+        t, p, knots = self.way
+        dive = np.cumsum(np.diff(t[knots], prepend=0.0) > 0.5 * self.after_s)
+        P = self.drift.covariance(t[knots], p[knots], dive)
+        return P, np.linalg.cholesky(P)
 
 
 def charted(rng: np.random.Generator, terrain: Terrain, change: str) -> DepthChart:
@@ -215,6 +258,11 @@ CASES = {
     "fish school": Case(MTI, fish=0.15, size=SMALL),
     "dense fish school": Case(MTI, fish=0.15, dense=True, size=SMALL),
     "tide": Case(MTI, tide=1.5, size=SMALL),
+    "steep tide": Case(MTI, steep=0.04, size=SMALL),
+    "late depth": Case(MTI, late=1.0, size=SMALL),
+    "smooth relief": Case(MTI, smooth_relief, size=SMALL),
+    "rough relief": Case(MTI, rough_relief, size=SMALL),
+    "two dives": Case(replace(MTI, start=4.0), tide=1.5, size=(8, 250.0, 25.0, 0), again=4),
     "chart": Case(LOST, size=LINE, chart="right"),
     "chart with holes": Case(LOST, size=LINE, chart="holes"),
     "chart elsewhere": Case(LOST, size=LINE, chart="elsewhere"),
@@ -246,21 +294,26 @@ class Survey:
 
 def draw(case: Case, seed: int) -> Survey:
     rng = np.random.default_rng([43, seed])
-    p = path(*case.size)
-    t = np.arange(len(p), dtype=float)
-    knots = t[:: int(KNOT_S)]
-    P, root = case.errors(len(knots))
+    t, p, at = case.way
+    knots, (P, root) = t[at], case.covariance
     e = root @ rng.standard_normal(len(P))
     error = np.stack([np.interp(t, knots, axis) for axis in e.reshape(-1, 2).T], axis=-1)
     terrain = case.terrain(rng)
-    way = np.gradient(p, axis=0)
+    way = np.gradient(p, t, axis=0)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     side = np.stack([-way[:, 1], way[:, 0]], axis=-1)
     reach = 0.0 if case.altimeter else 10.0 * np.tan(np.deg2rad(22.5)) / np.sqrt(2.0)
     signs = [(0.0, 0.0)] if case.altimeter else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
     arm = np.stack([reach * (a * way + b * side) for a, b in signs], axis=1)
     depth = terrain(p[:, None] + arm) + rng.normal(0.0, case.noise, arm.shape[:2])
-    depth += case.tide * np.sin(2.0 * np.pi * t / 10000.0)[:, None]
+    zero = case.tide * np.sin(2.0 * np.pi * t / 10000.0)
+    if case.steep:
+        slopes = np.random.default_rng([48, seed]).normal(0.0, case.steep, len(t) // 300 + 1)
+        zero += np.cumsum(np.repeat(slopes, 300)[: len(t)])
+    if case.late:
+        follows = gaussian_filter1d(terrain(p), 10.0)
+        zero += np.interp(t - case.late, t, follows) - follows
+    depth += zero[:, None]
     if case.fish:
         inside = np.interp(t, np.arange(0, len(t) + 20, 20), rng.uniform(size=len(t) // 20 + 2)) < case.fish
         depth -= inside[:, None] * (2.0 if case.dense else rng.uniform(0.0, 4.0, depth.shape))
@@ -316,7 +369,7 @@ def survey(case: Case, seed: int) -> Outcome:
             x, C = H[k : k + 2] @ off_chart, H[k : k + 2] @ after.P @ H[k : k + 2].T
             wrong += int(np.linalg.norm(x) > WRONG_M and x @ np.linalg.solve(C, x) > chi2.isf(1e-3, 2))
     rms = [float(np.sqrt(np.mean(x**2) * 2)) for x in (e, left)]
-    shape = shape_rms(left.reshape(-1, 2), drawn.true[:: int(KNOT_S)])
+    shape = shape_rms(left.reshape(-1, 2), drawn.true[np.searchsorted(drawn.time, drawn.knots)])
     used, crossings = len(found.closures), len(found.crossings)
     return Outcome(*rms, shape, nees, used, crossings, wrong, seconds, f"{found.text} {found.relief}")
 
@@ -342,7 +395,7 @@ def draw_figure(path: str, case: Case, seed: int) -> None:
     true = drawn.error[[np.abs(drawn.time - time).argmin() for time in crossing.times]]
     axis = np.arange(-30.0, 30.5, 0.5)
     shifts = true[0] - true[1] + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))[0]
+    L = field_at(drawn.lines, crossing, true[0] - true[1], 40.0, found.relief, None).at(shifts.reshape(-1, 2))
     image = right.pcolormesh(axis, axis, L.reshape(len(axis), -1).clip(min=-10.0), cmap="viridis")
     right.plot(0.0, 0.0, "r+", markersize=12)
     right.set(xlabel="shift from the true one, east [m]", ylabel="north [m]", aspect="equal")

@@ -101,7 +101,7 @@ def test_a_match_is_worth_the_mean_curvature_of_its_field():
     shifts = h * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1), (0, 0)], float)
     for _ in range(200):
         z = root @ rng.standard_normal(len(r))
-        L = Field((x, z[: len(x)]), (y, z[len(x) :]), RELIEF).at(shifts)[0] / h**2
+        L = Field((x, z[: len(x)]), (y, z[len(x) :]), RELIEF).at(shifts) / h**2
         cross = -(L[0] - L[1] - L[2] + L[3]) / 4.0
         curvature += np.array([[2 * L[8] - L[4] - L[5], cross], [cross, 2 * L[8] - L[6] - L[7]]]) / 200.0
     J = Field((x, z[: len(x)]), (y, z[len(x) :]), RELIEF).expected_information()

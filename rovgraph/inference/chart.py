@@ -158,27 +158,25 @@ class ChartField:
         own = relief.of_line(x)
         self._known, self._alone = own + chart.covariance(r), own + relief.covariance(r) + SLOPE**2 * away @ away.T
 
-    def at(self, shifts: Array) -> tuple[Array, Array]:
-        """The field and squared residuals by their number at g shifts, shape (g,) each."""
+    def at(self, shifts: Array) -> Array:
+        """The field at g shifts, shape (g,)."""
         off = self._z - self._chart.at(self._x + shifts[:, None])
         seen = np.isfinite(off)
         share = seen.mean(axis=1)
         whole, some = np.flatnonzero(share == 1.0), np.flatnonzero((share > SEEN) & (share < 1.0))
-        out, misfit = np.zeros(len(shifts)), np.ones(len(shifts))
-        for rows in (whole, *np.array_split(some, len(some) // 512 + 1)):
+        out = np.zeros(len(shifts))
+        for rows in (whole, *np.array_split(some, len(some) // 32 + 1)):
             use = seen[rows[:1]] if rows is whole else seen[rows]
-            with_chart, chi2 = _log_normal(self._known, np.where(seen[rows], off[rows], 0.0), use)
-            alone, _ = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
-            out[rows], misfit[rows] = with_chart - alone, chi2 / seen[rows].sum(axis=1)
-        return out, misfit
+            alone = _log_normal(self._alone, use * (self._z - self._z.mean()), use)
+            out[rows] = _log_normal(self._known, np.where(seen[rows], off[rows], 0.0), use) - alone
+        return out
 
 
-def _log_normal(covariance: Array, off: Array, use: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Log densities of residuals that are used, shape (g, n), without their constant, and squares of the white ones."""
+def _log_normal(covariance: Array, off: Array, use: NDArray[np.bool_]) -> Array:
+    """Log densities of residuals that are used, shape (g, n), without their constant."""
     L = np.linalg.cholesky(np.where(use[:, :, None] & use[:, None], covariance, np.eye(len(covariance))))
     white = (np.linalg.inv(L) @ off[..., None])[..., 0] if len(L) == 1 else np.linalg.solve(L, off[..., None])[..., 0]
-    chi2 = (white**2).sum(axis=-1)
-    return -0.5 * chi2 - np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1), chi2
+    return np.asarray(-0.5 * (white**2).sum(axis=-1) - np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1))
 
 
 def read_chart(settings: ChartSettings, origin: Origin | None) -> ChartFile | None:

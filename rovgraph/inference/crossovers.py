@@ -41,6 +41,7 @@ ON_CHART = -1  # "earlier line" of a crossing
 BESIDE_M = 6.0  # from the crossing and the range of the search, soundings that show something
 LEAST_CELLS, MOST_CELLS = 4, 80  # soundings of either line at a crossing
 GRID, STEPS_M = 0.2, (0.4, 1.2)  # step of a field: of the relief's length, its limits
+TOGETHER = 32  # shifts of a field, whose matrices fit into a processor's cache
 SIGMAS, FARTHEST_M, CHART_M = 3.5, 40.0, 250.0  # range of the search about what is predicted, and on a chart
 FALSE = 0.05  # prior share of crossings whose soundings are not those of the bottom
 HYPOTHESES = 100  # at most
@@ -48,8 +49,6 @@ LEAD = 10.0  # log likelihood over the next hypothesis [nats]; those behind by t
 SAME_M = 2.5  # shifts closer than that are the same
 ENOUGH = 3  # crossings
 AGREE = 0.5  # share of the crossings about which all likely hypotheses must agree
-SHOWS = 1.0  # of a field whose residuals count [nats]
-MISFIT = 1.5  # of the soundings' squared residuals, over what is expected
 REPEATS = 0.8  # rise of the correlation of lines with themselves: sand waves
 ROUNDS = 3  # of the search, each with crossings where the one before has them
 
@@ -347,7 +346,6 @@ def _match(
     gates = (
         (repetition(lines, 2.0 * reach) > REPEATS, "the bottom repeats itself, as sand waves do"),
         (best.score < LEAD, "soundings of its lines do not match"),
-        (best.misfit > MISFIT, "its soundings contradict the match"),
         (len(closures) < max(ENOUGH, AGREE * best.seen), "another match is nearly as likely"),
     )
     refused = next((why for fails, why in gates if fails), "")
@@ -397,7 +395,7 @@ class Field:
         self._own, self._z = own[0], z - z.mean()
         self._root = np.linalg.inv(np.linalg.cholesky(own[1]))
         self._known = self._root @ (w - w.mean())
-        self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0][0]
+        self._none = self._likelihood(np.zeros((1, len(z), len(w))))[0]
 
     def _common(self, x: Array, y: Array, shifts: Array) -> Array:
         """Covariance of the bottom's depth at places x + shift and y, shape (g, n, m)."""
@@ -405,19 +403,22 @@ class Field:
         r = np.sqrt(north * north + east * east)
         return self._relief.covariance(r) + SLOPE**2 * x @ y.T  # what a slope does over the shift is height
 
-    def _likelihood(self, common: Array) -> tuple[Array, Array]:
-        """Of g covariances of both lines, and squared residuals by their number."""
-        V = common @ self._root.T
-        L = np.linalg.cholesky(self._own - V @ np.swapaxes(V, 1, 2))
-        white = np.linalg.solve(L, (self._z - V @ self._known)[..., None])[..., 0]
-        chi2 = (white**2).sum(axis=1)
-        return -0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1), chi2 / len(self._z)
+    def _likelihood(self, common: Array) -> Array:
+        """Of g covariances of both lines."""
+        V, n = common @ self._root.T, len(self._z)
+        off = self._z - V @ self._known
+        bordered = np.empty((len(V), n + 1, n + 1))  # the last row of its root has the white residuals
+        bordered[:, :n, :n] = self._own - V @ np.swapaxes(V, 1, 2)
+        bordered[:, n, :n] = off
+        bordered[:, n, n] = 1.0 + (off**2).sum(axis=1) / self._relief.noise**2
+        L = np.linalg.cholesky(bordered)
+        chi2 = (L[:, n, :n] ** 2).sum(axis=1)
+        return np.asarray(-0.5 * chi2 - np.log(np.diagonal(L, axis1=1, axis2=2)[:, :n]).sum(axis=1))
 
-    def at(self, shifts: Array) -> tuple[Array, Array]:
-        """The field and squared residuals by their number at g shifts, shape (g,) each."""
-        parts = [shifts[k : k + 256] for k in range(0, len(shifts), 256)]
-        L, misfit = np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts])
-        return L - self._none, misfit
+    def at(self, shifts: Array) -> Array:
+        """The field at g shifts, shape (g,)."""
+        parts = [shifts[k : k + TOGETHER] for k in range(0, len(shifts), TOGETHER)]
+        return np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts]) - self._none
 
     def expected_information(self) -> Array:
         """Fisher's information on the shift where there is none, shape (2, 2) [1/m^2]: what a match is worth."""
@@ -465,7 +466,6 @@ class Hypothesis:
     score : log likelihood of the soundings over that without common relief
     closures : number of a crossing -> what its peak says
     seen : crossings so far
-    misfits : squared residuals at the peaks, by their number
     """
 
     mean: Array
@@ -473,12 +473,6 @@ class Hypothesis:
     score: float = 0.0
     closures: Mapping[int, LoopClosure] = field(default_factory=dict)
     seen: int = 0
-    misfits: tuple[float, ...] = ()
-
-    @property
-    def misfit(self) -> float:
-        """Mean of those of fields that show something."""
-        return float(np.mean(self.misfits)) if self.misfits else 1.0
 
     @property
     def sd(self) -> Array:
@@ -499,17 +493,15 @@ class Hypothesis:
         off = step * cells - m
         return cells, (off @ np.linalg.inv(V) * off).sum(axis=-1)
 
-    def branches(
-        self, k: int, times: tuple[float, float], places: Array, L: Array, misfit: Array, far: Array
-    ) -> "list[Hypothesis]":
+    def branches(self, k: int, times: tuple[float, float], places: Array, L: Array, far: Array) -> "list[Hypothesis]":
         """One for each peak of a field times what is predicted, and one in which its soundings are not the bottom's.
 
         Parameters
         ----------
         k, times : the crossing
         places : ndarray, shape (n, n, 2), shifts [m]
-        L, misfit, far : ndarray, shape (n, n), the field there (-inf where it is not known), its squared residuals, and
-            squared distances from what is predicted [sd^2]
+        L, far : ndarray, shape (n, n), the field there (-inf where it is not known), and squared distances from what is
+            predicted [sd^2]
         """
         from scipy.ndimage import maximum_filter  # type: ignore[attr-defined]
         from scipy.spatial import KDTree
@@ -529,7 +521,6 @@ class Hypothesis:
         place = np.stack([mean(x) for x in flat.T], axis=-1)
         off = flat - place[own]
         spread = np.array([[mean(a * b) for b in off.T] for a in off.T]).transpose(2, 0, 1) + step**2 / 12.0 * np.eye(2)
-        shown, misfits = mean(L[near]), mean(misfit[near])
         score = self.score + np.log1p(-FALSE) + np.log(mass) + density.max()
         out = [replace(self, score=self.score + float(np.log(FALSE)), seen=self.seen + 1)]
         before, H = np.linalg.inv(V), np.eye(2, len(self.mean), 2 * k)
@@ -538,9 +529,8 @@ class Hypothesis:
             information = (axes * np.maximum(value, 0.0)) @ axes.T
             pull = information @ m + (information + before) @ (place[j] - m)
             closures = {**self.closures, k: LoopClosure(times, information, pull)}
-            also = (*self.misfits, float(misfits[j])) if shown[j] > SHOWS else self.misfits
             moved = condition(self.mean, self.P, H, information, pull)
-            out.append(Hypothesis(*moved, float(score[j]), closures, self.seen + 1, also))
+            out.append(Hypothesis(*moved, float(score[j]), closures, self.seen + 1))
         return out
 
 
@@ -571,14 +561,14 @@ def associate(
         predicted = hypotheses[0].shift(k)[0]
         reach = min(float(np.linalg.norm(step * cells - predicted, axis=1).max()), FARTHEST_M) + BESIDE_M
         own_field = field_at(lines, crossings[k], predicted, reach, relief, chart)
-        values = np.array(own_field.at(step * cells[known]))[:, which]
+        values = own_field.at(step * cells[known])[which]
         branches, first = [], 0
         for hypothesis, (places, distance2), own in zip(hypotheses, windows, inside, strict=True):
-            L, misfit = np.full((2, *own.shape), -np.inf)
-            L[own], misfit[own] = values[:, first : first + own.sum()]
+            L = np.full(own.shape, -np.inf)
+            L[own] = values[first : first + own.sum()]
             first += int(own.sum())
             shifts = np.asarray(step * places, float)
-            branches += hypothesis.branches(k, crossings[k].times, shifts, L, misfit, distance2)
+            branches += hypothesis.branches(k, crossings[k].times, shifts, L, distance2)
         hypotheses = _pruned(branches)
     return hypotheses, widest
 

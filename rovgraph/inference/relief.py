@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
-SCATTER = 4.0  # sd of a cell's soundings over what is usual, from which they are no bottom's: fish
+SCATTER = 4.0  # sd of soundings in a cell and those beside it over what is usual, from which they are fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
-STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment
+STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment; longest silence
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
 STRETCH, STRETCHES = 32, 60  # cells of a stretch, and stretches, to which relief is fitted
 LENGTHS_M = np.geomspace(1.0, 30.0, 12)  # of relief
@@ -99,6 +99,10 @@ def _straight(time: Array, heading: Array, position: Array) -> tuple[Array, Arra
     total = np.concatenate([[0.0], np.cumsum(e)])
     low, high = np.maximum(np.arange(len(t)) - width // 2, 0), np.minimum(np.arange(len(t)) + width // 2 + 1, len(t))
     straight = np.abs((total[high] - total[low]) / (high - low)) > STRAIGHT
+    if len(at) < STRETCH:
+        return []
+    later = np.searchsorted(at, t).clip(1, len(at) - 1)
+    straight &= at[later] - at[later - 1] < STRAIGHT_S
     p = np.stack([np.interp(t, time, axis) for axis in position.T], axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     parts, first = [], 0
@@ -120,17 +124,31 @@ def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Ar
     off = place - here
     along = np.floor((np.interp(at, t, arc) + off @ way) / CELL_M).astype(np.int64)
     across = np.round(off @ (-way[1], way[0]) / CELL_M).astype(np.int64)
-    _, which, count = np.unique(np.column_stack([along, across]), axis=0, return_inverse=True, return_counts=True)
+    cells, which, count = np.unique(np.column_stack([along, across]), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
-    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count)) / np.maximum(count - 1, 1)
-    usual = float(np.median(square[count > 1])) if (count > 1).any() else 0.0
+    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count))
+    square, spare = _around(cells, square), _around(cells, count - 1.0)
+    square /= np.maximum(spare, 1.0)
+    usual = float(np.median(square[spare > 0.5])) if (spare > 0.5).any() else 0.0
     good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
     noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
     mean = mean[good]
     along, across = np.round(mean[:, 1:3].T).astype(np.int64)
     return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise)
+
+
+def _around(cells: NDArray[np.int64], values: Array) -> Array:
+    """Sums over n cells, shape (n, 2), and their neighbours: beams that land astride two cells leave few in each."""
+    from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
+
+    if not len(cells):
+        return values
+    own = tuple((cells - cells.min(axis=0)).T)
+    grid = np.zeros(np.ptp(cells, axis=0) + 1)
+    grid[own] = values
+    return np.asarray(9.0 * uniform_filter(grid, 3, mode="constant")[own])
 
 
 @dataclass(frozen=True)
