@@ -75,7 +75,9 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     time, heading, position : ndarray, shapes (n,), (n,), (n, 2), of the track
     at, place, depth : ndarray, shapes (m,), (m, 2), (m,), of the soundings, in the order of time
     """
-    t, p, arc, parts = _straight(time, heading, position)
+    if len(at) < STRETCH:
+        return []
+    t, p, arc, parts = _straight(time, heading, position, at)
     lines = []
     for first, last in parts:
         own = slice(*np.searchsorted(at, (t[first], t[last - 1])).tolist())
@@ -86,12 +88,17 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
 
 def line_ends(time: Array, heading: Array, position: Array) -> list[float]:
     """When straight parts of a track have ended, for good [s]; parameters of `lines_of`."""
-    t, _, _, parts = _straight(time, heading, position)
+    t, _, _, parts = _straight(time, heading, position, time)
     return [float(t[last]) for _, last in parts if last < len(t) - int(STRAIGHT_S)]
 
 
-def _straight(time: Array, heading: Array, position: Array) -> tuple[Array, Array, Array, list[tuple[int, int]]]:
-    """A track every second: time, place and way so far; and its straight parts, first and one after the last."""
+def _straight(
+    time: Array, heading: Array, position: Array, at: Array
+) -> tuple[Array, Array, Array, list[tuple[int, int]]]:
+    """A track every second: time, place and way so far; and its straight parts, first and one after the last.
+
+    They end where there is nothing ``at`` times of soundings, shape (m,), for long.
+    """
     t = np.arange(time[0], time[-1], 1.0)
     e = np.interp(t, time, np.cos(heading)) + 1j * np.interp(t, time, np.sin(heading))
     e /= np.maximum(np.abs(e), 1e-9)
@@ -99,8 +106,6 @@ def _straight(time: Array, heading: Array, position: Array) -> tuple[Array, Arra
     total = np.concatenate([[0.0], np.cumsum(e)])
     low, high = np.maximum(np.arange(len(t)) - width // 2, 0), np.minimum(np.arange(len(t)) + width // 2 + 1, len(t))
     straight = np.abs((total[high] - total[low]) / (high - low)) > STRAIGHT
-    if len(at) < STRETCH:
-        return []
     later = np.searchsorted(at, t).clip(1, len(at) - 1)
     straight &= at[later] - at[later - 1] < STRAIGHT_S
     p = np.stack([np.interp(t, time, axis) for axis in position.T], axis=-1)
