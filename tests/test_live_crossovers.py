@@ -127,7 +127,7 @@ def test_a_dive_that_is_not_trusted_is_not_smoothed_for_a_match():
 @pytest.mark.parametrize("on", [False, True])
 def test_isam2_matches_nothing_and_says_so(on):
     pytest.importorskip("gtsam")
-    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 20.0, 1, "straight")
+    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 40.0, 1, "straight")
     nav = Navigator(case.config, patient=True, smooth=True, clocks=Clocks(trust=True))
     for m in case.log.measurements():
         nav.take(message(m))
