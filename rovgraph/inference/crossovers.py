@@ -402,7 +402,8 @@ class Field:
     def at(self, shifts: Array) -> Array:
         """The field at g shifts, shape (g,)."""
         parts = [shifts[k : k + TOGETHER] for k in range(0, len(shifts), TOGETHER)]
-        return np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts]) - self._none
+        fields = [self._likelihood(self._common(self._x, self._y, part)) for part in parts]
+        return np.asarray(np.concatenate(fields) - self._none)
 
     def expected_information(self) -> Array:
         """Fisher's information on the shift where there is none, shape (2, 2) [1/m^2]: what a match is worth."""
@@ -475,7 +476,7 @@ class Hypothesis:
     def distance2(self, k: int, shifts: Array) -> Array:
         """Of shifts at a crossing from what is predicted [sd^2]."""
         m, V = self.shift(k)
-        return ((shifts - m) @ np.linalg.inv(V) * (shifts - m)).sum(axis=-1)
+        return np.asarray(((shifts - m) @ np.linalg.inv(V) * (shifts - m)).sum(axis=-1))
 
     def branches(
         self, k: int, times: tuple[float, float], step: float, places: Array, L: Array, far: Array

@@ -133,9 +133,8 @@ def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Ar
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
-    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count))
-    square, spare = _around(cells, square), _around(cells, count - 1.0)
-    square /= np.maximum(spare, 1.0)
+    scatter, spare = np.bincount(which, (depth - mean[which, 5]) ** 2), _around(cells, np.asarray(count - 1.0, float))
+    square = _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0)
     usual = float(np.median(square[spare > 0.5])) if (spare > 0.5).any() else 0.0
     good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
     noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
