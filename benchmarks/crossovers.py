@@ -3,6 +3,7 @@
     python benchmarks/crossovers.py --surveys 20        errors of a track and soundings, drawn
     python benchmarks/crossovers.py --dives 3           dives of an independent simulator, through the command line
     python benchmarks/crossovers.py --predicted 4       what crosslines would leave, predicted and then driven
+    python benchmarks/crossovers.py --dives 6 --small --online    the same, live: where the vehicle is after crosslines
     python benchmarks/crossovers.py --figure docs/images/crossovers.png
 
 A survey has 12 lines of 500 m, 25 m apart, and four crosslines, 10 m above a bottom whose relief is 1 m over 20 m.
@@ -20,7 +21,7 @@ import numpy as np
 from fault_campaign.beams import Beams, Bottom, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, run_dive, settled_rows, tracks, write_dive
+from fault_campaign.judge import Dive, nees, run_dive, settled_rows, tracks, write_dive
 from fault_campaign.motion import Motion, Profile
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
 from numpy.typing import NDArray
@@ -422,8 +423,8 @@ class Relief(Bottom):
         return self.terrain(place), normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> Motion:
-    """The same survey at 1 m/s, its first line to the north; turns of 90 degrees within 10 s."""
+def survey_motion(lines: int, length: float, apart: float, crosslines: int, home: float = 0.0) -> Motion:
+    """The same survey at 1 m/s, its first line to the north; turns of 90 degrees within 10 s; then ``home`` metres."""
     turn, over = 10.0, 25.0
     beside = apart - 0.62 * turn  # of a straight between two turns
     legs: list[tuple[float, float]] = []  # length of a straight and the turn after it
@@ -438,20 +439,25 @@ def survey_motion(lines: int, length: float, apart: float, crosslines: int) -> M
         t += straight
         heading.append((t, turn, side * np.pi / 2.0))
         t += turn
+    t += home
     surge = Profile(0.0, ((8.0, 4.0, 1.0),), ((0.005, 5.1, 0.3),))
     still, level = Profile(0.0, (), ((0.003, 6.7, 1.1),)), Profile(0.0, (), ((2e-4, 5.9, 0.7),))
     return Motion(t, Profile(0.0, tuple(heading)), (surge, still, still), level, level, depth=10.0)
 
 
 def dive(
-    terrain: Callable[[np.random.Generator], Terrain], seed: int, size: tuple[int, float, float, int], gyro_scale: float
+    terrain: Callable[[np.random.Generator], Terrain],
+    seed: int,
+    size: tuple[int, float, float, int],
+    gyro_scale: float,
+    home: float = 0.0,
 ) -> Dive:
     """A dive with an MTi with compass: offset and deviation of 0.5 degrees, scale of the DVL 0.3 %.
 
     The gyro's scale decides how far it shows the deviation: an sd of 0.5 % is stated, ``gyro_scale`` is drawn.
     """
     rng = np.random.default_rng([44, seed])
-    motion = survey_motion(*size)
+    motion = survey_motion(*size, home)
     vehicle = make_vehicle("mti", ("ahrs", "depth"))
     beams = Beams(bottom=Relief(20.0, terrain=terrain(rng)))
     vehicle.imu.gyr_matrix = np.diag(1.0 + rng.normal(0.0, gyro_scale, 3))
@@ -467,27 +473,40 @@ def dive(
     return Dive(streams, config, motion, hidden)
 
 
-def print_dives(row: str, seeds: range, small: bool, gyro_scale: float) -> None:
-    """Both ways, smoothed: rms, that of the shape, sd, NEES, seconds, and what was said."""
+HOME_M, END_S = 90.0, 30.0  # after the crosslines of a live dive, and of its end that counts
+
+
+def print_dives(row: str, seeds: range, small: bool, gyro_scale: float, online: bool) -> None:
+    """Both ways, smoothed: rms, that of the shape, sd, NEES, seconds, and what was said; live at the end likewise."""
 
     def inspect(folder: Path, dive: Dive) -> dict[str, float]:
-        rows = settled_rows(dict(tracks(folder))["smoothed"], dive)
+        track = dict(tracks(folder))
+        rows = settled_rows(track["smoothed"], dive)
         true = dive.motion.local(rows["time"].to_numpy())[:, :2]
-        return {"shape": shape_rms(true - rows[["north", "east"]].to_numpy(), true)}
+        found = {"shape": shape_rms(true - rows[["north", "east"]].to_numpy(), true)}
+        for kind in track if online else ():
+            end = settled_rows(track[kind], dive).iloc[-int(END_S) :]
+            quantities, rms, sd = nees(end, dive.motion)
+            found |= {f"{kind} rms": rms, f"{kind} sd": sd, f"{kind} nees": quantities["position"]}
+        return found
 
     for seed in seeds:
-        made = dive(CASES[row].terrain, seed, SMALL if small else Case().size, gyro_scale)
+        size = SMALL if small else Case().size
+        made = dive(CASES[row].terrain, seed, size, gyro_scale, HOME_M if online else 0.0)
         for crossovers in (False, True):
             begin, config = time.perf_counter(), merge(made.configuration, {"graph": {"crossovers": crossovers}})
-            got = run_dive(replace(made, configuration=config), inspect=inspect)
-            rms, sd, nees = got.rms["smoothed"], got.sd["smoothed"], got.nees["smoothed"]["position"]
-            seconds, said = time.perf_counter() - begin, "; ".join(line for line in got.said if "crossovers:" in line)
-            how = "with" if crossovers else "without"
-            print(
-                f"| {row} {seed} | {how} | {rms:.2f} | {got.found['shape']:.2f} | {sd:.2f} | {nees:.2f} | "
-                f"{seconds:.0f} | {got.verdicts['smooth']} | {said} |",
-                flush=True,
-            )
+            got = run_dive(replace(made, configuration=config), online, inspect)
+            seconds, said = time.perf_counter() - begin, [line for line in got.said if "crossovers:" in line]
+            ways = {"smooth": [got.rms["smoothed"], got.found["shape"], got.sd["smoothed"]]}
+            ways["smooth"].append(got.nees["smoothed"]["position"])
+            for kind, command in (("smoothed", "smooth"), ("online", "online")) if online else ():
+                ways[f"{command}, end"] = [got.found[f"{kind} {name}"] for name in ("rms", "sd", "nees")]
+            for way, numbers in ways.items():
+                cells = " | ".join(f"{number:.2f}" for number in numbers)
+                live, verdict = way.startswith("online"), got.verdicts[way.partition(",")[0]]
+                text = "; ".join([line for line in said if line.startswith("online") == live][-1:])
+                how = "with" if crossovers else "without"
+                print(f"| {row} {seed} | {how} | {way} | {cells} | {seconds:.0f} | {verdict} | {text} |", flush=True)
 
 
 def print_predicted(row: str, seeds: range, gyro_scale: float) -> None:
@@ -532,6 +551,7 @@ def main() -> None:
     parser.add_argument("--dives", type=int, default=0, help="through the command line, of the first row alone")
     parser.add_argument("--predicted", type=int, default=0, help="small surveys with and without crosslines")
     parser.add_argument("--small", action="store_true", help="dives of 8 lines of 250 m, with three crosslines")
+    parser.add_argument("--online", action="store_true", help="dives through the online mode, too")
     parser.add_argument("--gyro-scale", type=float, default=0.005, help="sd of the gyro's scale errors in dives")
     parser.add_argument("--figure", help="draw a survey to this file")
     given = parser.parse_args()
@@ -542,7 +562,8 @@ def main() -> None:
         print_predicted(given.rows[0], range(given.first, given.first + given.predicted), given.gyro_scale)
         return
     if given.dives:
-        print_dives(given.rows[0], range(given.first, given.first + given.dives), given.small, given.gyro_scale)
+        seeds = range(given.first, given.first + given.dives)
+        print_dives(given.rows[0], seeds, given.small, given.gyro_scale, given.online)
         return
     for name in given.rows:
         out = []

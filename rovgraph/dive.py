@@ -259,7 +259,7 @@ class _Solver:
         if self.found:
             more["noise_found"] = [one.as_dict() for one in self.found]
         assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
-        if self.initial.config.graph.crossovers or self.chart is not None:
+        if self.initial.config.matches_bottom:
             text, found = self._cross()
             assumptions.insert(0, text)
             more |= {} if found is None else {"crossovers": found.as_dict()}

@@ -29,13 +29,14 @@ ORIGIN = 58.3, 14.6
 OFF = 14.0, -9.0  # how far the dive begins from where it is said to
 
 
-def write_chart(path: Path, terrain: Terrain, change=lambda z: z) -> None:
+def write_chart(path: Path, terrain: Terrain, change=lambda z: z, wider: float = 0.0) -> None:
     """Depths of every metre with a noise of 0.3 m, in a projection about the origin; its first row is the north."""
-    place = np.stack(np.meshgrid(np.arange(330.0, -60.0, -1.0), np.arange(-60.0, 120.0), indexing="ij"), axis=-1)
+    north, east = np.arange(330.0 + wider, -60.0 - wider, -1.0), np.arange(-60.0 - wider, 120.0 + wider)
+    place = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1)
     depth = terrain(place) + np.random.default_rng(5).normal(0.0, 0.3, place.shape[:2])
     values = change(depth).astype("float32")
     about = f"+proj=aeqd +lat_0={ORIGIN[0]} +lon_0={ORIGIN[1]} +ellps=WGS84 +units=m"
-    corner = rasterio.Affine(1.0, 0.0, -60.5, 0.0, -1.0, 330.5)
+    corner = rasterio.Affine(1.0, 0.0, east[0] - 0.5, 0.0, -1.0, north[0] + 0.5)
     shape = {"height": values.shape[0], "width": values.shape[1], "count": 1, "dtype": "float32"}
     with rasterio.open(path, "w", driver="GTiff", crs=about, transform=corner, **shape) as file:
         file.write(values, 1)
@@ -80,6 +81,24 @@ def test_a_dive_that_begins_elsewhere_than_it_says_is_placed_by_a_chart(dived):
     assert (place["sd"] <= 1.0).all() and (place["value"].abs() < 3.0 * place["sd"] + 0.1).all()
     said = json.loads((out / "summary.json").read_text())["assumptions"]
     assert sum("pieces on the chart matched" in line for line in said) == 1
+
+
+@pytest.mark.slow
+def test_live_a_chart_shows_within_500_m_where_a_vehicle_is_that_may_be_anywhere_within_50_m(dived):
+    folder, terrain, dive = dived
+    write_chart(folder / "wide.tif", terrain, wider=35.0)
+    start = {"north_m": 32.0, "east_m": -39.0, "position_sd_m": 50.0}
+    config = merge(dive.configuration, {"start": start, "chart": {"file": str(folder / "wide.tif"), "sd_m": 0.3}})
+    (folder / "live.yaml").write_text(json.dumps(config))
+    arguments = [f"file:{folder / 'log.csv'}", "--config", folder / "live.yaml", "--out", folder / "live"]
+    code, errors = run_command(["online", *map(str, arguments), "--speed", "max", "--no-refine"])
+    assert code == 0, errors
+    track = pd.read_csv(folder / "live" / "trajectory_filtered.csv")
+    time, place = track["time"].to_numpy(), track[["north", "east"]].to_numpy()
+    early, after = time < 60.0, time > 400.0  # the second is within 400 m of the start
+    assert off(dive, time[early], place[early]) > 40.0
+    assert off(dive, time[after], place[after]) < 3.0
+    assert track["north_sd"][after].max() < 10.0 and "pieces on the chart matched" in errors
 
 
 @pytest.mark.slow

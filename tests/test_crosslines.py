@@ -14,13 +14,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 from crossovers import Relief as Ground
 from crossovers import flat, matern, path, survey_motion
-from dives import simulated
 from fault_campaign.beams import Beams, stated
 from fault_campaign.campaign import merge
 from fault_campaign.instruments import sample
 from fault_campaign.judge import Dive, run_command, write_dive
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
-from live import flown
 
 import rovgraph as rg
 from rovgraph.inference.crossovers import Drift, Field, crossings_of
@@ -247,10 +245,3 @@ def test_the_command_prints_and_keeps_what_crosslines_would_show(tmp_path):
     assert [len(row["ends_m"]) for row in kept["ranking"]] == [0, 1, 2, 4]
     assert "Drift of the survey" in (out / "report.html").read_text()
     assert kept["in_words"][-1].startswith("No crossline shows a shift, a rotation or a scale")
-
-
-@pytest.mark.parametrize("on", [False, True])
-def test_live_it_is_said_that_nothing_is_matched(on):
-    case = simulated(rg.Config().with_values(graph={"crossovers": on}), 60.0, 1, "straight")
-    said = [event.text for solution in flown(case).solutions for event in solution.events]
-    assert any("crossovers and charts correct no live track" in text for text in said) == on

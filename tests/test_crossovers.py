@@ -125,11 +125,34 @@ def test_two_crossings_are_too_few():
 
 def test_a_loop_closure_corrects_both_ends_by_what_they_are_unsure_of():
     P = np.diag([1.0, 1.0, 3.0, 3.0])
-    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P).given(
-        [LoopClosure((1.0, 0.0), 1e8 * np.eye(2), np.array([2e8, 0.0]))]
-    )
+    closure = LoopClosure((1.0, 0.0), 1e8 * np.eye(2), np.array([2e8, 0.0]))
+    after = Drift(np.array([0.0, 1.0]), np.zeros(4), P, beams_sd=0.0).given([closure])
     assert after.mean == pytest.approx([-0.5, 0.0, 1.5, 0.0], abs=1e-6)
     assert np.diag(after.P) == pytest.approx([0.75] * 4, abs=1e-6)
+
+
+def test_a_loop_closure_counts_between_knots_and_no_more_than_beams_can_tell():
+    closure = LoopClosure((9.5, 0.5), 1e8 * np.eye(2), np.array([2e8, 0.0]))
+    after = Drift(np.array([0.0, 1.0, 9.0, 10.0]), np.zeros(8), np.eye(8), beams_sd=0.3).given([closure])
+    variance = 2 * 0.5 + 2 * 0.3**2  # of the mean of two knots, twice, and of the beams of two lines
+    assert after.mean == pytest.approx(np.repeat([-0.5, 0.5], 4) * np.tile([2.0, 0.0], 4) / variance, abs=1e-6)
+    assert np.diag(after.P) == pytest.approx([1.0 - 0.25 / variance] * 8, abs=1e-6)
+
+
+def test_fish_are_left_out_where_beams_land_astride_two_cells():
+    t = np.repeat(np.arange(0.0, 100.0, 1.0), 2)
+    rng, fish = np.random.default_rng(2), (t > 40.0) & (t < 55.0)
+    depth = 20.0 + 0.05 * rng.standard_normal(len(t)) - np.where(fish, rng.uniform(0.0, 4.0, len(t)), 0.0)
+    place = np.column_stack([t, 3.0 + 0.1 * rng.standard_normal(len(t))])  # cells end at 3 m
+    (line,) = lines_of(t, 0.0 * t, np.column_stack([t, 0.0 * t]), t, place, depth)
+    assert np.abs(line.depth - 20.0).max() < 0.2
+
+
+def test_lines_end_where_soundings_do():
+    t = np.concatenate([np.arange(0.0, 60.0), np.arange(4000.0, 4060.0)])
+    place = np.column_stack([t - 3900.0 * (t > 100.0), 50.0 * (t > 100.0)])
+    lines = lines_of(t, 0.0 * t, place, t, place, np.full(len(t), 20.0))
+    assert [(line.time[0] < 5.0, line.time[-1] < 70.0) for line in lines] == [(True, True), (False, False)]
 
 
 def test_lines_end_at_turns():

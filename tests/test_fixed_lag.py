@@ -198,7 +198,7 @@ def reinitialised(
         if engine.snapshots and engine.snapshots[-1].index > newest:
             newest = engine.snapshots[-1].index
             at(engine.snapshots[-1].time - measurements[0].time)
-            thread.step(engine, False)
+            thread.step(engine, False, None, "trusted")
     engine.finish()
     thread.close()
     return known

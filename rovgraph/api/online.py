@@ -325,7 +325,8 @@ class Online:
             if folder is not None:
                 if not resume:
                     prepare(folder, force, sources)
-                files = Files(folder, config, warnings, resume, replayed=self.engine == "isam2")
+                whole = self.engine == "isam2" or config.matches_bottom
+                files = Files(folder, config, warnings, resume, replayed=whole)
             opened_outputs.pop_all()
         told: list[Callable[[Solution], None]] = [each.send for each in receivers]
         if watched is not None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.inference import gauss_newton
@@ -342,10 +343,15 @@ class ChainOptimum:
             out[name] = np.broadcast_to(P_y[own, own], (len(P), *P_y[own, own].shape)) if border else P[:, own, own]
         return out
 
+    @property
+    def newest_targets(self) -> NDArray[np.int64]:
+        """Of `newest_covariance`, targets in the last keyframe and the border, as `rovgraph.kernels.chain` has them."""
+        layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
+        return np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
+
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.inference.optimum.Optimum`."""
-        layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
-        chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
+        chosen = self.newest_targets
         newest = self._end.newest_covariance(self._end.border_covariance(self.believed))
         return np.asarray(newest[np.ix_(chosen, chosen)])
 

@@ -32,7 +32,6 @@ from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, l
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
-from rovgraph.problem.problem import Index
 
 KNOT_S, KNOTS = 10.0, 1000  # between knots of the drift, and how many at most
 BEAMS_M = 0.1  # sd of where soundings are, beside the track's error, where it is not known: 0.5 degrees at 10 m
@@ -69,10 +68,6 @@ class Crossing:
     times: tuple[float, float]
     centre: Array
 
-    def beams_variance(self, sd: float) -> float:
-        """Of its shift, by where soundings are: those of one line, or of two [m^2]."""
-        return sd**2 if self.earlier == ON_CHART else 2.0 * sd**2
-
 
 @dataclass(frozen=True)
 class LoopClosure:
@@ -88,11 +83,6 @@ class LoopClosure:
     times: tuple[float, float]
     information: Array
     pull: Array
-
-    def with_noise(self, variance: float) -> "LoopClosure":
-        """Where the shift that soundings see has a noise of its own beside the errors [m^2]."""
-        share = np.linalg.inv(np.eye(2) + variance * self.information)
-        return replace(self, information=share @ self.information, pull=share @ self.pull)
 
 
 def condition(mean: Array, P: Array, H: Array, information: Array, pull: Array) -> tuple[Array, Array]:
@@ -136,14 +126,36 @@ class Drift:
         H = [np.interp(later, self.time, knot) - np.interp(earlier, self.time, knot) for knot in np.eye(len(self.time))]
         return np.asarray(np.kron(np.transpose(H), np.eye(2)), float)
 
+    def beams(self, ends: Sequence[tuple[float, float]]) -> Array:
+        """Variance that beams bring to k shifts of one line or two, north and east, shape (2 k,) [m^2]."""
+        return np.repeat(self.beams_sd**2 * np.isfinite(ends).sum(axis=1), 2)
+
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
-        H, information = self.between([c.times for c in closures]), np.zeros((2 * len(closures),) * 2)
+        moved, less = self.shows(closures, self.P)
+        return replace(self, mean=self.mean + moved, P=self.P - less)
+
+    def shows(self, closures: Sequence[LoopClosure], cross: Array) -> tuple[Array, Array]:
+        """What closures say of d other variables: by how much these move, and by how much less they vary.
+
+        Parameters
+        ----------
+        closures : of this drift
+        cross : ndarray, shape (d, 2 m), covariance with the drift
+
+        Returns
+        -------
+        ndarrays, shapes (d,) and (d, d)
+        """
+        ends, information = [c.times for c in closures], np.zeros((2 * len(closures),) * 2)
         for k, closure in enumerate(closures):
             information[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = closure.information
-        pull = np.array([c.pull for c in closures]).ravel()
-        mean, P = condition(self.mean, self.P, H, information, pull)
-        return replace(self, mean=mean, P=P)
+        seen, H = np.linalg.inv(np.eye(len(information)) + information * self.beams(ends)), self.between(ends)
+        information, pull = seen @ information, seen @ np.array([c.pull for c in closures]).ravel()
+        column = cross @ H.T
+        gain = column @ np.linalg.inv(np.eye(len(H)) + information @ H @ self.P @ H.T)
+        less = gain @ information @ column.T
+        return gain @ (pull - information @ H @ self.mean), 0.5 * (less + less.T)
 
 
 @dataclass(frozen=True)
@@ -165,18 +177,16 @@ class Crossovers:
     refused: str = ""
     chart: str = ""
 
+    @property
+    def matched(self) -> list[bool]:
+        """Which crossings were."""
+        times = {closure.times for closure in self.closures}
+        return [c.times in times for c in self.crossings]
+
     def as_dict(self) -> dict[str, object]:
         """For summary.json."""
-        return {
-            "relief_sd_m": self.relief.sd,
-            "relief_length_m": self.relief.length,
-            "time_s": [c.times[0] for c in self.crossings],
-            "matched": self._matched(self.crossings),
-        }
-
-    def _matched(self, crossings: Sequence[Crossing]) -> list[bool]:
-        matched = {closure.times for closure in self.closures}
-        return [c.times in matched for c in crossings]
+        relief = {"relief_sd_m": self.relief.sd, "relief_length_m": self.relief.length}
+        return {**relief, "time_s": [c.times[0] for c in self.crossings], "matched": self.matched}
 
     @property
     def text(self) -> str:
@@ -184,10 +194,10 @@ class Crossovers:
         chart = f"; the chart is not used: {self.chart}" if self.chart else ""
         if self.refused:
             return f"crossovers: nothing is used: {self.refused}{chart}"
-        crossed = self._matched([c for c in self.crossings if c.earlier != ON_CHART])
-        charted = self._matched([c for c in self.crossings if c.earlier == ON_CHART])
-        counts = [f"{sum(crossed)} of {len(crossed)} crossings of the survey's lines"] if crossed else []
-        counts += [f"{sum(charted)} of {len(charted)} pieces on the chart"] if charted else []
+        counts = []
+        for name, charted in (("crossings of the survey's lines", False), ("pieces on the chart", True)):
+            own = [m for c, m in zip(self.crossings, self.matched, strict=True) if (c.earlier == ON_CHART) == charted]
+            counts += [f"{sum(own)} of {len(own)} {name}"] if own else []
         relief = f"relief of {self.relief.sd:.2f} m over {self.relief.length:.1f} m"
         return f"crossovers: {' and '.join(counts)} matched, by {relief}{chart}"
 
@@ -218,16 +228,8 @@ def with_crossovers(
     beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
-    track, used = estimate.trajectory, bottom.soundings[bottom.soundings["used"] == 1]
-    soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
-    lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
-    drift = replace(drift_of(estimate, lines), beams_sd=_beams_sd(used, track))
-    around, place = None, beliefs[CHART_PLACE]
-    if chart is not None:
-        drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
-        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
-        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
-    found = match(lines, drift, around)
+    track, place = estimate.trajectory, beliefs[CHART_PLACE]
+    drift, found = matched(estimate, bottom, beliefs, chart, origin)
     left = drift.given(found.closures) if found.closures else drift
     if chart is not None:
         shown = {CHART_PLACE: left.P[-2:, -2:]} if place.estimate else {}
@@ -250,8 +252,37 @@ def with_crossovers(
     return replace(estimate, trajectory=corrected, posterior=None), found
 
 
-def _beams_sd(soundings: pd.DataFrame, track: Trajectory) -> float:
+def matched(
+    estimate: Estimate, bottom: Bottom, beliefs: Mapping[str, Belief], chart: ChartFile | None, origin: Origin
+) -> tuple[Drift, Crossovers]:
+    """The drift of a smoothed track, and what its soundings show of it; parameters of `with_crossovers`.
+
+    With a chart, the last knot of the drift is that of the chart.
+    """
+    track, lines = estimate.trajectory, lines_over(estimate.trajectory, bottom)
+    drift = replace(drift_of(estimate, lines), beams_sd=_beams_sd(bottom, track))
+    around, place = None, beliefs[CHART_PLACE]
+    if chart is not None:
+        drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
+        reach = min(SIGMAS * float(np.sqrt(np.diag(drift.P).max())), CHART_M) + PIECE_M
+        around = chart.around(track.p_n[:, :2].min(axis=0) - reach, track.p_n[:, :2].max(axis=0) + reach, origin)
+    return drift, match(lines, drift, around)
+
+
+def lines_over(track: Trajectory, bottom: Bottom) -> list[Line]:
+    """The straight parts of a track, with the soundings under it."""
+    used = _used(bottom)
+    soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
+    return lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
+
+
+def _used(bottom: Bottom) -> pd.DataFrame:
+    return bottom.soundings[bottom.soundings["used"] == 1]
+
+
+def _beams_sd(bottom: Bottom, track: Trajectory) -> float:
     """Of where soundings are beside the track's error."""
+    soundings = _used(bottom)
     variance = soundings["north_sd"] ** 2 + soundings["east_sd"] ** 2
     error = np.interp(soundings["time"], track.time, track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
     return float(np.sqrt(np.median(np.maximum(variance - error, 0.0)) / 2.0))
@@ -295,11 +326,7 @@ def _match(
     best = hypotheses[0]
     likely = np.array([h.mean for h in hypotheses if h.score > best.score - LEAD]).reshape(-1, len(crossings), 2)
     spread = np.linalg.norm(likely - likely[0], axis=2).max(axis=0)
-    closures = [
-        closure.with_noise(crossings[k].beams_variance(drift.beams_sd))
-        for k, closure in best.closures.items()
-        if spread[k] < SAME_M
-    ]
+    closures = [closure for k, closure in best.closures.items() if spread[k] < SAME_M]
     gates = (
         (repetition(lines, 2.0 * reach) > REPEATS, "the bottom repeats itself, as sand waves do"),
         (best.score < LEAD, "soundings of its lines do not match"),
@@ -375,7 +402,8 @@ class Field:
     def at(self, shifts: Array) -> Array:
         """The field at g shifts, shape (g,)."""
         parts = [shifts[k : k + TOGETHER] for k in range(0, len(shifts), TOGETHER)]
-        return np.hstack([self._likelihood(self._common(self._x, self._y, part)) for part in parts]) - self._none
+        fields = [self._likelihood(self._common(self._x, self._y, part)) for part in parts]
+        return np.asarray(np.concatenate(fields) - self._none)
 
     def expected_information(self) -> Array:
         """Fisher's information on the shift where there is none, shape (2, 2) [1/m^2]: what a match is worth."""
@@ -441,29 +469,31 @@ class Hypothesis:
         own = slice(2 * k, 2 * k + 2)
         return self.mean[own], self.P[own, own]
 
-    def window(self, k: int, step: float, most: float) -> tuple[Index, Array]:
-        """Where to look: cells of a lattice, shape (n, n, 2), and their squared distances from the mean [sd^2]."""
-        m, V = self.shift(k)
-        n = int(min(SIGMAS * np.sqrt(np.linalg.eigvalsh(V)[-1]), most) / step) + 1
-        axis = np.arange(-n, n + 1)
-        cells = np.round(m / step).astype(np.int64) + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        off = step * cells - m
-        return cells, (off @ np.linalg.inv(V) * off).sum(axis=-1)
+    def reach(self, k: int) -> float:
+        """How far from there the shift may be [m]."""
+        return SIGMAS * float(np.sqrt(np.linalg.eigvalsh(self.shift(k)[1])[-1]))
 
-    def branches(self, k: int, times: tuple[float, float], places: Array, L: Array, far: Array) -> "list[Hypothesis]":
+    def distance2(self, k: int, shifts: Array) -> Array:
+        """Of shifts at a crossing from what is predicted [sd^2]."""
+        m, V = self.shift(k)
+        return np.asarray(((shifts - m) @ np.linalg.inv(V) * (shifts - m)).sum(axis=-1))
+
+    def branches(
+        self, k: int, times: tuple[float, float], step: float, places: Array, L: Array, far: Array
+    ) -> "list[Hypothesis]":
         """One for each peak of a field times what is predicted, and one in which its soundings are not the bottom's.
 
         Parameters
         ----------
         k, times : the crossing
-        places : ndarray, shape (n, n, 2), shifts [m]
-        L, far : ndarray, shape (n, n), the field there (-inf where it is not known), and squared distances from what is
+        step, places : of a lattice of shifts, and these, ndarray, shape (n, m, 2) [m]
+        L, far : ndarray, shape (n, m), the field there (-inf where it is not known), and squared distances from what is
             predicted [sd^2]
         """
         from scipy.ndimage import maximum_filter  # type: ignore[attr-defined]
         from scipy.spatial import KDTree
 
-        (m, V), step = self.shift(k), places[1, 0, 0] - places[0, 0, 0]
+        m, V = self.shift(k)
         density = L - 0.5 * far + np.log(step**2 / (2.0 * np.pi)) - 0.5 * np.linalg.slogdet(V)[1]
         local = density == maximum_filter(density, 2 * int(SAME_M / step) + 1)
         tops = np.argwhere(local & (density > density.max() - 2.0 * LEAD))
@@ -498,34 +528,36 @@ def associate(
 
     Next comes the crossing that the best hypothesis predicts best.
     """
+    from scipy.ndimage import find_objects  # type: ignore[attr-defined]
+
     step = float(np.clip(GRID * relief.length, *STEPS_M))
-    H = drift.between([c.times for c in crossings])
-    beams = np.repeat([c.beams_variance(drift.beams_sd) for c in crossings], 2)
-    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + np.diag(beams))
+    ends = [c.times for c in crossings]
+    H = drift.between(ends)
+    prior = Hypothesis(H @ drift.mean, H @ drift.P @ H.T + np.diag(drift.beams(ends)))
     hypotheses, widest, left = [prior], 0.0, set(range(len(crossings)))
     while left:
         k = min(left, key=lambda k: hypotheses[0].sd[k])
-        far = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(hypotheses[0].shift(k)[1])[-1]))
         most = CHART_M if crossings[k].earlier == ON_CHART else FARTHEST_M
-        if far > most:
+        if hypotheses[0].reach(k) > most:
             break
         left.remove(k)
-        widest = max(widest, far)
-        windows = [h.window(k, step, most) for h in hypotheses]
-        inside = [distance2 < SIGMAS**2 for _, distance2 in windows]
-        cells = np.concatenate([cells[own] for (cells, _), own in zip(windows, inside, strict=True)])
-        known, which = np.unique(cells @ (1 << 20, 1), return_index=True, return_inverse=True)[1:]
-        predicted = hypotheses[0].shift(k)[0]
-        reach = min(float(np.linalg.norm(step * cells - predicted, axis=1).max()), FARTHEST_M) + BESIDE_M
-        own_field = field_at(lines, crossings[k], predicted, reach, relief, chart)
-        values = own_field.at(step * cells[known])[which]
-        branches, first = [], 0
-        for hypothesis, (places, distance2), own in zip(hypotheses, windows, inside, strict=True):
-            L = np.full(own.shape, -np.inf)
-            L[own] = values[first : first + own.sum()]
-            first += int(own.sum())
-            shifts = np.asarray(step * places, float)
-            branches += hypothesis.branches(k, crossings[k].times, shifts, L, distance2)
+        widest = max(widest, hypotheses[0].reach(k))
+        predicted = np.array([h.shift(k)[0] for h in hypotheses])
+        reach = np.array([min(h.reach(k), most) for h in hypotheses])[:, None]
+        low, high = (predicted - reach).min(axis=0), (predicted + reach).max(axis=0)
+        axes = [step * np.arange(np.floor(a / step), np.ceil(b / step) + 1) for a, b in zip(low, high, strict=True)]
+        shifts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        far = [h.distance2(k, shifts) for h in hypotheses]
+        inside = [own <= max(SIGMAS**2, own.min()) for own in far]  # at least the nearest
+        known = np.any(inside, axis=0)
+        beyond = float(np.linalg.norm(shifts[known] - predicted[0], axis=1).max())
+        near = field_at(lines, crossings[k], predicted[0], min(beyond, FARTHEST_M) + BESIDE_M, relief, chart)
+        L, branches = np.full(known.shape, -np.inf), []
+        L[known] = near.at(shifts[known])
+        for hypothesis, own, distance2 in zip(hypotheses, inside, far, strict=True):
+            (box,) = find_objects(own.astype(int))
+            there = np.where(own[box], L[box], -np.inf)
+            branches += hypothesis.branches(k, ends[k], step, shifts[box], there, distance2[box])
         hypotheses = _pruned(branches)
     return hypotheses, widest
 

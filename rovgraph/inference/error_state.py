@@ -230,25 +230,44 @@ def reinitialised(engine: FilterEngine, problem: Problem, states: State) -> tupl
     Gaussian : of the newest keyframe
     Optimum : of the dive so far
     """
-    initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
-    best, _ = without_what_noise_moves(optimum(problem, initial, states, calibration))
+    best, _ = without_what_noise_moves(optimum(problem, engine.initial, states, calibration))
+    return newest_known(engine, best), best
+
+
+def newest_known(engine: FilterEngine, best: Optimum, also: tuple[Array, Array] | None = None) -> Gaussian:
+    """The newest keyframe of a smoothed dive, as the filter has it.
+
+    Parameters
+    ----------
+    engine : the filter's
+    best : the dive, smoothed
+    also : ndarrays, shapes (d,) and (d, d), in the order of `Optimum.newest_covariance`: how the newest keyframe moves
+        by what its smoother does not know, and how much less it varies; considered variables stay as they are
+    """
+    layout = engine.layout
     names, size = (*best.unknowns.estimated, *best.unknowns.considered), layout.size
     known = np.concatenate([np.arange(15)] + [np.r_[layout.columns[name]] for name in names])
-    places = remembered(best, initial.config.place.remembered)
+    places = remembered(best, engine.initial.config.place.remembered)
     # the covariance of all, what is considered at the end: of what no sensor has shown yet, that of the start
     start, more = engine.start(), PLACE_DIM * len(places)
     joint = np.zeros((layout.width + more, layout.width + more))
     joint[:size, :size], joint[size + more :, size + more :] = start.P, start.L @ start.L.T
     known = np.concatenate([known + more * (known >= size), np.arange(size, size + more)])
     joint[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
-    estimated = slice(0, size + more)
+    estimated, moved = slice(0, size + more), np.zeros(len(joint))
+    if also is not None:
+        considered = joint[size + more :, size + more :].copy()
+        moved[known], less = also
+        joint[np.ix_(known, known)] -= less
+        joint[size + more :, size + more :] = considered
     L = np.asarray(np.linalg.cholesky(joint[size + more :, size + more :]), dtype=float)
     B = np.asarray(np.linalg.solve(L, joint[size + more :, estimated]).T, dtype=float)
-    state = best.state.at([len(problem) - 1])
+    state = best.state.at([len(best.problem) - 1])
     calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
     newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
-    return replace(Gaussian.of(newest, joint[estimated, estimated] - B @ B.T, places), B=B, L=L), best
+    found = replace(Gaussian.of(newest, joint[estimated, estimated] - B @ B.T, places), B=B, L=L)
+    return found if also is None else engine.retract(found, moved[estimated], found.P)
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:

@@ -230,6 +230,24 @@ class Posterior:
             P += np.outer(u, u)
         return P
 
+    def horizontal_with_newest(self, keyframes: Sequence[int]) -> Array:
+        """Covariance of the newest keyframe and the calibration with the IMU's north and east at m keyframes.
+
+        Returns
+        -------
+        ndarray, shape (d, 2 m), rows in the order of `rovgraph.inference.optimum.Optimum.newest_covariance`
+        """
+        known, best, newest = self._marginals(), self.optimum, len(self.time) - 1
+        H, X, gains = known._at([*keyframes, newest] if keyframes[-1] != newest else keyframes)
+        m, held, out = len(keyframes), H[-1], []
+        for k in range(len(H) - 1, -1, -1):
+            held = held if k == len(H) - 1 else gains[k] @ held
+            if k < m:
+                rows = best.state.R_nb[keyframes[k], :2]
+                by_y = rows @ X[k, POSITION] @ known.P_y
+                out.append(np.hstack([rows @ held[POSITION] + by_y @ X[-1].T, by_y]))
+        return np.concatenate(out[::-1])[:, best.newest_targets].T
+
     def draw(self, count: int, rng: np.random.Generator) -> Iterator[tuple[State, Array]]:
         """States at the IMU from the distribution, and the displacement of their positions in n, shape (n, 3)."""
         root, wide, believed = self._marginals().root, self.optimum.wide, self._believed

@@ -75,6 +75,30 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     time, heading, position : ndarray, shapes (n,), (n,), (n, 2), of the track
     at, place, depth : ndarray, shapes (m,), (m, 2), (m,), of the soundings, in the order of time
     """
+    if len(at) < STRETCH:
+        return []
+    t, p, arc, parts = _straight(time, heading, position, at)
+    lines = []
+    for first, last in parts:
+        own = slice(*np.searchsorted(at, (t[first], t[last - 1])).tolist())
+        line = _in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own])
+        lines += [line] if len(line.time) > STRETCH // 2 else []
+    return lines
+
+
+def line_ends(time: Array, heading: Array, position: Array) -> list[float]:
+    """When straight parts of a track have ended, for good [s]; parameters of `lines_of`."""
+    t, _, _, parts = _straight(time, heading, position, time)
+    return [float(t[last]) for _, last in parts if last < len(t) - int(STRAIGHT_S)]
+
+
+def _straight(
+    time: Array, heading: Array, position: Array, at: Array
+) -> tuple[Array, Array, Array, list[tuple[int, int]]]:
+    """A track every second: time, place and way so far; and its straight parts, first and one after the last.
+
+    They end where there is nothing ``at`` times of soundings, shape (m,), for long.
+    """
     t = np.arange(time[0], time[-1], 1.0)
     e = np.interp(t, time, np.cos(heading)) + 1j * np.interp(t, time, np.sin(heading))
     e /= np.maximum(np.abs(e), 1e-9)
@@ -82,23 +106,19 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     total = np.concatenate([[0.0], np.cumsum(e)])
     low, high = np.maximum(np.arange(len(t)) - width // 2, 0), np.minimum(np.arange(len(t)) + width // 2 + 1, len(t))
     straight = np.abs((total[high] - total[low]) / (high - low)) > STRAIGHT
-    if len(at) < STRETCH:
-        return []
     later = np.searchsorted(at, t).clip(1, len(at) - 1)
     straight &= at[later] - at[later - 1] < STRAIGHT_S
     p = np.stack([np.interp(t, time, axis) for axis in position.T], axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-    lines, first = [], 0
+    parts, first = [], 0
     while first < len(t):
         last = first
         while last < len(t) and straight[last] and (e[last] * np.conj(e[first])).real > BEND:
             last += 1
         if last - first > LINE_S and arc[last - 1] - arc[first] > LINE_M:
-            own = slice(*np.searchsorted(at, (t[first], t[last - 1])).tolist())
-            line = _in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own])
-            lines += [line] if len(line.time) > STRETCH // 2 else []
+            parts.append((first, last))
         first = max(last, first + 1)
-    return lines
+    return t, p, arc, parts
 
 
 def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array) -> Line:
@@ -113,9 +133,8 @@ def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Ar
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
     mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
-    square = np.bincount(which, (depth - mean[which, 5]) ** 2, len(count))
-    square, spare = _around(cells, square), _around(cells, count - 1.0)
-    square /= np.maximum(spare, 1.0)
+    scatter, spare = np.bincount(which, (depth - mean[which, 5]) ** 2), _around(cells, np.asarray(count - 1.0, float))
+    square = _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0)
     usual = float(np.median(square[spare > 0.5])) if (spare > 0.5).any() else 0.0
     good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
     noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0

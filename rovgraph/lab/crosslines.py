@@ -266,9 +266,9 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
     """Loop closures of the crossings that come within the range of the search, in the order in which they do."""
     if len(crossings) < ENOUGH:
         return []
-    H = drift.between([c.times for c, _ in crossings])
-    beams = [c.beams_variance(drift.beams_sd) for c, _ in crossings]
-    P, mean = H @ drift.P @ H.T + np.diag(np.repeat(beams, 2)), np.zeros(len(H))
+    ends = [c.times for c, _ in crossings]
+    H = drift.between(ends)
+    P, mean = H @ drift.P @ H.T + np.diag(drift.beams(ends)), np.zeros(len(H))
     left, closures = [*range(len(crossings))], list[LoopClosure]()
     while left:
         reach = [SIGMAS * float(np.sqrt(np.linalg.eigvalsh(P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])[-1])) for k in left]
@@ -277,7 +277,7 @@ def _matched(drift: Drift, crossings: Sequence[tuple[Crossing, Array]]) -> list[
             break
         crossing, J = crossings[k]
         P = condition(mean, P, np.eye(2, len(H), 2 * k), J, np.zeros(2))[1]
-        closures.append(LoopClosure(crossing.times, J, np.zeros(2)).with_noise(beams[k]))
+        closures.append(LoopClosure(crossing.times, J, np.zeros(2)))
     return closures if len(closures) >= ENOUGH else []
 
 

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rovgraph.diagnosis.alarm import verdict_of
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom, bottom_under
+from rovgraph.inference.chart import read_chart
 from rovgraph.inference.filter import ErrorLayout
 from rovgraph.inference.filter_step import Gaussian
 from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
@@ -24,11 +26,21 @@ from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.beacons import SHOWN_SD_M, UnplacedBeacons
 from rovgraph.live.clocks import Clocks
+from rovgraph.live.crossovers import Crossed, LiveCrossovers
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.sensor_faults import Crosscheck, Faults, Health, Incoherence
-from rovgraph.live.solution import BeaconPlace, CurrentAt, Event, RangeCircle, SensorHealth, ShipPose, Solution
+from rovgraph.live.solution import (
+    BeaconPlace,
+    CrossingPlace,
+    CurrentAt,
+    Event,
+    RangeCircle,
+    SensorHealth,
+    ShipPose,
+    Solution,
+)
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.model.calibration import ACOUSTICS, BEAM_SENSORS, LAYERS, LAYOUT, MOUNT, TABLE, beacon_names
 from rovgraph.model.config import Config
@@ -46,6 +58,7 @@ PLACE_OF_RANGES = (*MOUNT, "dvl_lever_arm", "dvl_scale")  # calibration variable
 RANGE_S = 15.0  # longest age of an acoustic range that is shown
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
+SOMEWHERE = 0.0, 0.0  # before a first fix says where
 UNEXPECTED = "began after the first seconds, and is not used"
 
 
@@ -89,7 +102,7 @@ class Navigator:
         self.faults = Faults(self.config)
         self._crosscheck = Crosscheck(self.config)
         self._startup = Startup(self.config.with_values(imu={"max_gap_s": NO_GAP_IS_TOO_LONG_S}))
-        self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
+        self._reinitialisations = self._smoothing_now_and_then()
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()
         self._beacons: UnplacedBeacons | None = None  # until the dive begins
@@ -102,7 +115,19 @@ class Navigator:
         self._bottom: Bottom | None = None  # that these show, once a solution has placed them
         self._beam_seen: dict[str, float] = {}  # when each was valid last [s]
         self._outgrown = False  # the plane, which has been said
+        self._crossings: tuple[CrossingPlace, ...] = ()  # that were looked at last
         self._located = self.config.start.located  # where the fixes count from
+
+    def _smoothing_now_and_then(self) -> Reinitialisations | None:
+        """With crossovers, where these are asked for."""
+        if not self.reinitialise or self.smooth:
+            return None
+        chart = read_chart(self.config.chart, self.config.environment.origin or SOMEWHERE)
+        return Reinitialisations(self.patient, LiveCrossovers(chart) if self.config.matches_bottom else None)
+
+    @property
+    def _crossovers(self) -> LiveCrossovers | None:
+        return None if self._reinitialisations is None else self._reinitialisations.crossovers
 
     @property
     def origin(self) -> Origin | None:
@@ -174,6 +199,8 @@ class Navigator:
         known = self.engine.snapshots[0].time if self.engine is not None else -np.inf
         if self._reinitialisations is not None:
             self._reinitialisations.patient = True
+        if (crossovers := self._crossovers) is not None:
+            crossovers.held = True  # until all of it is there
         for measurement in log.measurements():
             if measurement.time > known:
                 accepted = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
@@ -181,6 +208,8 @@ class Navigator:
                     self._consider(accepted, by_hand=accepted.sensor == "fix")  # some may be
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
+        if crossovers is not None:
+            crossovers.held = False
         self._events = [event for event in self._take_events() if event.time > told + 1e-6]  # as rounded there
 
     def say(self, source: str, kind: str, text: str) -> None:
@@ -247,6 +276,7 @@ class Navigator:
             predicted_s=float(t.time[0]) - engine.snapshots[-1].time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
+            crossings=self._crossings,
             **self._below(engine, known, t),
             **self._acoustics(engine, known, t.p_n[0], unplaced),
         )
@@ -338,8 +368,8 @@ class Navigator:
             self.say("start", "assumed", text)
         for text in self._startup.doubts:
             self.say("start", "warning", text)
-        if config.graph.crossovers or config.chart.file is not None:
-            text = "crossovers and charts correct no live track, after a crossline neither; smooth the recorded log"
+        if self._crossovers is None and config.matches_bottom:
+            text = "crossovers and charts correct no track of --engine isam2; smooth the recorded log"
             self.say("start", "warning", text)
         self._located |= any(m.sensor == "fix" for m in self._startup.measurements)
         for measurement in self._startup.measurements:
@@ -352,6 +382,8 @@ class Navigator:
         if joining is None or self._keeps(joining, m):
             return
         engine = joining
+        if (crossovers := self._crossovers) is not None:
+            crossovers.take(m)
         before = engine.snapshots[-1] if engine.snapshots else None
         outcome = engine.add(m)
         if outcome != InsertResult.IN:
@@ -377,16 +409,27 @@ class Navigator:
         """Continue from the dive so far as it is smoothed, where that is ready; the time waited for it [s]."""
         waited = 0.0
         if self._reinitialisations is not None:
-            waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
+            verdict = verdict_of(self.alarms.history.values())
+            waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted, self.origin, verdict)
             engine.keeps_all = self._reinitialisations.pending
             if (adopted := self._reinitialisations.adopted) is not None:
                 self.alarms.reinitialised(adopted)
                 self._reinitialisations.adopted = None
                 if self._beacons is not None:
                     self._beacons.reinitialised(adopted.time, adopted.p_n)
+            if (crossed := self._reinitialisations.crossed) is not None:
+                self._cross(crossed)
+                self._reinitialisations.crossed = None
         if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
             self._adopt(engine, self.isam2)
         return waited
+
+    def _cross(self, crossed: Crossed) -> None:
+        """Say what crossovers have shown, from which the filter goes on."""
+        self._crossings = crossed.places
+        if (crossovers := self._crossovers) is not None and (news := crossovers.tell(crossed)) is not None:
+            self.say("crossovers", *news)
+            self._here = np.full(3, np.nan)  # the vehicle did not move
 
     def _believe_what_is_shown(self, engine: FixedLag) -> FixedLag:
         """A filter with the place of a beacon, or the latency of stamps, that the dive shows; the same without any."""

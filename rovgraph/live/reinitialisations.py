@@ -1,7 +1,8 @@
 """Re-initialises the filter from the smoothed dive so far, which a thread computes while measurements arrive.
 
 The smoothed dive also shows wrong constants and errors that last, which the filter cannot show. It is examined for
-alarms, as `rovgraph smooth` examines a whole dive.
+alarms, as `rovgraph smooth` examines a whole dive. Where crossovers were asked for, it is also smoothed after each line
+and matched (`rovgraph.live.crossovers`).
 """
 
 import time as host
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.alarm import Statistic, Verdict
 from rovgraph.diagnosis.constants import contradicted_constants_in, earth_rate_of
 from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.diagnosis.unstated_noise import unstated
@@ -26,6 +27,8 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.score_test import as_chain
 from rovgraph.inference.trajectory import Trajectory
+from rovgraph.live.crossovers import NOT_COMPUTED, Crossed, LiveCrossovers, Survey
+from rovgraph.model.origin import Origin
 from rovgraph.model.state import BIAS, COLUMNS, VELOCITY
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.problem import Problem
@@ -33,6 +36,7 @@ from rovgraph.rules import RULES
 
 Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
 _Smoothed = tuple[Gaussian, list[Statistic], Optimum]
+_Work = tuple[Crossed | None, _Smoothed | None]
 
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 FREED = 20  # keyframes, after each new one, once no re-initialisation needs them: thousands at once take 40 ms
@@ -63,14 +67,17 @@ class Reinitialisations:
     Attributes
     ----------
     patient : wait for the thread, so that a replay can be repeated
+    crossovers : None = nothing is matched
     news : what went wrong, one line each, since it was last emptied
-    adopted : what the filter continues from, until it is taken
+    adopted, crossed : what the filter continues from, and what crossovers said, until these are taken
     waited : for the thread, which only a replay does that is faster than it [s]
     """
 
     patient: bool
+    crossovers: LiveCrossovers | None = None
     news: list[str] = field(default_factory=list)
     adopted: "Adopted | None" = None
+    crossed: Crossed | None = None
     waited: float = 0.0
 
     def __post_init__(self) -> None:
@@ -78,38 +85,46 @@ class Reinitialisations:
         self._due = list(REINITIALISE_AT_S)
         self._passed: list[Keyframe] = []
         self._shown: list[Statistic] = []  # by the newest smoothed dive
-        self._running: tuple[int, Future[_Smoothed]] | None = None
+        self._running: tuple[int, bool, Future[_Work]] | None = None
 
     def take(self, snapshot: FilterSnapshot) -> None:
         """Remember a keyframe that the lag has passed, as long as any reinitialisation is to come."""
-        if self._due:
+        if self.pending:
             self._passed.append(_keyframe(snapshot))
+        if self.crossovers is not None:
+            self.crossovers.passed(snapshot)
 
-    def step(self, engine: FixedLag, dvl_contradicted: bool) -> float:
+    def step(self, engine: FixedLag, dvl_contradicted: bool, origin: Origin | None, verdict: Verdict) -> float:
         """After a keyframe of the engine; the time waited for the thread, as only a fast replay does [s].
 
-        ``dvl_contradicted`` has the meaning that it has in `_smoothed`.
+        Parameters
+        ----------
+        engine : the filter
+        dvl_contradicted : of `_smoothed`
+        origin, verdict : of the dive so far, for `LiveCrossovers.survey`
         """
         before = self.waited
-        if self._running is None and self._due:
-            self._begin(engine, dvl_contradicted)
+        if self._running is None and self.pending:
+            self._begin(engine, dvl_contradicted, origin, verdict)
         if self._running is not None:
             try:
                 self._adopt(engine, *self._running)
             except InputError as error:
                 self.news.append(f"the filter is reinitialised no more ({error}); it goes on as it is")
                 self._stop()
-        if not self._due:
+        if not self.pending:
             del self._passed[-FREED:]
         return self.waited - before
 
     @property
     def pending(self) -> bool:
         """Whether any reinitialisation is to come, so that the dive has to be kept."""
-        return bool(self._due)
+        return bool(self._due) or self.crossovers is not None
 
     def again(self) -> None:
         """Start the smoothing again, for a filter with more sensors."""
+        if self._running is not None and self.crossovers is not None:
+            self.crossovers.due = True
         self._running = None
 
     def anew(self, engine: FixedLag) -> None:
@@ -125,37 +140,42 @@ class Reinitialisations:
 
     def _stop(self) -> None:
         """Smooth no more; `step` frees the keyframes."""
-        self._due, self._running = [], None
+        self._due, self._running, self.crossovers = [], None, None
         self._thread.shutdown(wait=False, cancel_futures=True)
 
-    def _begin(self, engine: FixedLag, dvl_contradicted: bool) -> None:
+    def _begin(self, engine: FixedLag, dvl_contradicted: bool, origin: Origin | None, verdict: Verdict) -> None:
         """Have the dive up to the oldest keyframe smoothed that the filter can continue from, if it is due."""
-        oldest, dive = engine.oldest(), engine.assembly.problem
-        if oldest.time - float(dive.time[0]) < self._due[0]:
+        oldest, dive, crossovers = engine.oldest(), engine.assembly.problem, self.crossovers
+        due = bool(self._due) and oldest.time - float(dive.time[0]) >= self._due[0]
+        if not due and (crossovers is None or crossovers.held or not crossovers.due):
             return
+        survey = None if crossovers is None else crossovers.survey(origin, verdict)
         waiting = [_keyframe(snapshot) for snapshot in engine.snapshots if snapshot.index <= oldest.index]
         keyframes, dive = [*self._passed, *waiting], dive.upto(engine.place(oldest) + 1)
-        work = self._thread.submit(_smoothed, engine.filter, dive, keyframes, self._shown, dvl_contradicted)
-        self._running = oldest.index, work
+        about = self._shown, dvl_contradicted, survey, due
+        self._running = oldest.index, due, self._thread.submit(_smoothed, engine.filter, dive, keyframes, *about)
 
-    def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
+    def _adopt(self, engine: FixedLag, index: int, due: bool, future: "Future[_Work]") -> None:
         """Continue from the thread's result, if ready; the keyframes that the lag has passed since are filtered."""
         if not self.patient and not future.done():
             return
         began = host.perf_counter()
-        known, self._shown, best = future.result()
+        self.crossed, found = future.result()
         self.waited += host.perf_counter() - began
-        oldest, gates, dive = engine.oldest().index, dict[str, float](), engine.assembly.problem
-        for k in range(index + 1, oldest + 1):
-            known = engine.filter.step(dive, k - engine.assembly.forgotten, known, gates).filtered
-        newest = max(index, oldest)
-        before = next((snapshot for snapshot in engine.snapshots if snapshot.index == newest), None)
-        if engine.adopt(newest, known) and before is not None:
-            after, filtered = (engine.trajectory([before.keyframe], [one]) for one in (known, before.known))
-            self.adopted = Adopted(after, filtered, self._shown, best.problem.time, best.state.p_n)
-        self._due.pop(0)
         self._running = None
-        if not self._due:
+        if due:
+            self._due.pop(0)
+        if found is not None:
+            known, self._shown, best = found
+            oldest, gates, dive = engine.oldest().index, dict[str, float](), engine.assembly.problem
+            for k in range(index + 1, oldest + 1):
+                known = engine.filter.step(dive, k - engine.assembly.forgotten, known, gates).filtered
+            newest = max(index, oldest)
+            before = next((snapshot for snapshot in engine.snapshots if snapshot.index == newest), None)
+            if engine.adopt(newest, known) and before is not None:
+                after, filtered = (engine.trajectory([before.keyframe], [one]) for one in (known, before.known))
+                self.adopted = Adopted(after, filtered, self._shown, best.problem.time, best.state.p_n)
+        if not self.pending:
             self._stop()
 
 
@@ -169,7 +189,9 @@ def _smoothed(
     keyframes: Sequence[Keyframe],
     before: list[Statistic],
     dvl_contradicted: bool,
-) -> _Smoothed:
+    survey: Survey | None,
+    due: bool,
+) -> _Work:
     """The newest of some keyframes, from all data so far, and what these show.
 
     Parameters
@@ -177,10 +199,26 @@ def _smoothed(
     dive, keyframes : the dive so far
     before : what fewer keyframes have shown
     dvl_contradicted : the DVL's axes or clock are wrong, which looks like noise and like another place of the DVL
+    survey : to be matched
+    due : the dive is to be smoothed whether there is anything to match or not
+
+    Returns
+    -------
+    what crossovers say; the keyframe, what is shown, and the smoothed dive, None where the filter goes on as it is
     """
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
+    crossed = None if survey is None else survey.refused(engine.initial, dive, states)
+    if not due and crossed is not None:
+        return crossed, None
     known, best = reinitialised(engine, dive, states)
-    return known, _shown(best, engine.initial, before, dvl_contradicted), best
+    shown = _shown(best, engine.initial, before, dvl_contradicted)
+    if survey is not None and crossed is None:
+        crossed = NOT_COMPUTED
+        with suppress(InputError, np.linalg.LinAlgError):
+            crossed = survey.match(engine, best, shown)
+        if not due and not survey.used and crossed.known is None:
+            return crossed, None
+    return crossed, (known if crossed is None or crossed.known is None else crossed.known, shown, best)
 
 
 def _shown(

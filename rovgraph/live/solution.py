@@ -84,6 +84,15 @@ class RangeCircle(NamedTuple):
     radius: float
 
 
+class CrossingPlace(NamedTuple):
+    """Where the survey crosses its own lines, or a piece of a line on a chart [m], and whether its soundings match."""
+
+    north: float
+    east: float
+    matched: bool
+    on_chart: bool
+
+
 class CurrentAt(NamedTuple):
     """The current at a depth, by profiles of the water [m, m/s]."""
 
@@ -119,6 +128,7 @@ class Solution:
     update_s : duration of the newest update [s]
     current : by profiles of the water, at depths about the vehicle's, the shallowest first
     ship, beacons, ranges : of an acoustic system: the ship, beacons in their place or in one of two, the newest ranges
+    crossings : that the newest match of the survey's lines looked at
     """
 
     time: float
@@ -149,3 +159,4 @@ class Solution:
     ship: ShipPose | None = None
     beacons: tuple[BeaconPlace, ...] = ()
     ranges: tuple[RangeCircle, ...] = ()
+    crossings: tuple[CrossingPlace, ...] = ()

@@ -422,6 +422,11 @@ class Config(ConfigSection):
         return None if stated is None else str(stated)
 
     @property
+    def matches_bottom(self) -> bool:
+        """Whether soundings are to correct the track, by earlier lines or by a chart."""
+        return self.graph.crossovers or self.chart.file is not None
+
+    @property
     def knows_sound_speed(self) -> bool:
         """Whether the DVL's velocities are made by the speed of sound in the water."""
         true = self.dvl.sound_speed_mps, self.sound.profile, self.sound.salinity_psu

@@ -636,7 +636,7 @@ class Graph(ConfigSection):
         True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
     )
     crossovers: bool = Field(
-        False, description="correct the smoothed track where soundings of lines that cross or run again must agree"
+        False, description="correct the track where soundings of lines that cross or run again must agree"
     )
 
     @property

@@ -15,7 +15,7 @@ import numpy as np
 
 from rovgraph.live.marks import Marks
 from rovgraph.live.outputs.json_lines import as_dict
-from rovgraph.live.solution import BeaconPlace, RangeCircle, ShipPose, Solution
+from rovgraph.live.solution import BeaconPlace, CrossingPlace, RangeCircle, ShipPose, Solution
 from rovgraph.log.units import shown
 from rovgraph.model.calibration import BEAM_SENSORS, TABLE
 from rovgraph.model.origin import Origin, lat_lon
@@ -190,6 +190,7 @@ class View:
             "ship": None if s.ship is None else _plain(s.ship),
             "beacons": [_plain(beacon) for beacon in s.beacons],
             "ranges": [_plain(circle) for circle in s.ranges],
+            "crossings": [_plain(crossing) for crossing in s.crossings],
         }
 
     def update(self, cursor: Cursor) -> str | None:
@@ -240,7 +241,7 @@ def _degrees(points: list[Any], origin: Origin) -> list[list[float]]:
     return degrees
 
 
-def _plain(values: ShipPose | BeaconPlace | RangeCircle) -> dict[str, Any]:
+def _plain(values: ShipPose | BeaconPlace | RangeCircle | CrossingPlace) -> dict[str, Any]:
     """By name, null for what is not known."""
     known = values._asdict()
     return {name: _rounded(value) if isinstance(value, float) else value for name, value in known.items()}

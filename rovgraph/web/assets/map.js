@@ -164,6 +164,7 @@ export class LiveMap {
     this.track.draw(c, (n, e) => this.toScreen(n, e));
     if (this.track.length) this.drawHome();
     for (const mark of this.state?.marks ?? []) this.drawMark(mark);
+    for (const crossing of this.state?.crossings ?? []) this.drawCrossing(crossing);
     for (const range of this.state?.ranges ?? []) this.drawRange(range);
     for (const beacon of this.state?.beacons ?? []) this.drawBeacon(beacon);
     if (this.state?.ship) this.drawShip(this.state.ship);
@@ -321,6 +322,21 @@ export class LiveMap {
     c.lineWidth = 1.5;
     c.stroke();
     c.setLineDash([]);
+  }
+
+  // Where soundings of two lines, or of a line and a chart, agree: a ring; a cross where they were not matched.
+  drawCrossing(crossing) {
+    const c = this.context;
+    const [x, y] = this.toScreen(crossing.north, crossing.east);
+    c.beginPath();
+    if (crossing.matched) c.arc(x, y, 5, 0, 2 * Math.PI);
+    else for (const side of [-4, 4]) {
+      c.moveTo(x - 4, y - side);
+      c.lineTo(x + 4, y + side);
+    }
+    c.strokeStyle = crossing.matched ? palette.ink : palette.soft;
+    c.lineWidth = 1.5;
+    c.stroke();
   }
 
   drawBeacon(beacon) {

@@ -85,9 +85,9 @@ function showState(news) {
 function showNumbers() {
   gauges.show(state, map.track);
   const { longer, shorter } = ellipse(state);
-  const signs = [[state.ship, "grey hull: the ship"], [state.beacons?.length, "diamond: beacon"], [state.ranges?.length, "dotted circle: newest range"]];
-  at("acoustics-legend").textContent = signs.filter(([known]) => known).map(([, text]) => text).join(" · ");
-  at("acoustics-legend").hidden = !at("acoustics-legend").textContent;
+  const signs = [[state.ship, "grey hull: the ship"], [state.beacons?.length, "diamond: beacon"], [state.ranges?.length, "dotted circle: newest range"], [state.crossings?.length, "ring: lines match (cross: not)"]];
+  at("signs-legend").textContent = signs.filter(([known]) => known).map(([, text]) => text).join(" · ");
+  at("signs-legend").hidden = !at("signs-legend").textContent;
   at("ellipse-legend").textContent = `ellipse: 95 %${longer >= 0 ? `, half axes ${metres(longer)} × ${metres(shorter)} m` : ""}`;
 }
 
