@@ -1,5 +1,7 @@
 """A stretch in which one sensor contradicts all others is found by its cost, and nothing else is taken out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from broken import BROKEN, FROM, changed_data
@@ -70,13 +72,16 @@ def test_a_tilt_of_the_dvl_does_not_widen_the_stretch_of_its_bias():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
-    case = simulated(falcon(), 200.0, seed)
-    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
-    silent = interrupted(case.log, float(log["imu"].time[0]) + FROM, BIASED_S, "dvl")
-    errors = [rms(position_errors(smoothed(one, case.config).trajectory, case)) for one in (log, silent)]
-    assert errors[0] <= 1.5 * errors[1]
+def test_with_a_biased_stretch_tracks_are_as_good_as_without_its_pings():
+    """Over six dives: in one, either track is the better one by chance."""
+    errors = []
+    for seed in range(1, 7):
+        case = simulated(falcon(), 200.0, seed)
+        log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+        silent = interrupted(case.log, float(log["imu"].time[0]) + FROM, BIASED_S, "dvl")
+        errors.append([rms(position_errors(smoothed(one, case.config).trajectory, case)) for one in (log, silent)])
+    biased, without = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert biased <= 1.2 * without
 
 
 @pytest.mark.slow
@@ -90,8 +95,9 @@ def test_solutions_of_a_dive_with_the_same_gates_share_the_search(case, monkeypa
     assert dive.searches.saved_s > 0.0
     assert again.solution.stretches == first.solution.stretches != ()
     assert_array_equal(again.state.p_n, first.state.p_n)
-    dive.optimum(first.state)  # where the biased pings are out from the start: another optimum
-    assert len(searches) == 2
+    gates = {**first.solution.gates, "dvl": np.zeros_like(first.solution.gates["dvl"])}
+    other = replace(first.solution, gates=gates)
+    assert dive.searches.from_optimum(other, lambda: other) is other  # another optimum has a search of its own
 
 
 @pytest.mark.slow
