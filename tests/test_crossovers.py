@@ -181,6 +181,16 @@ def test_fish_are_left_out():
     assert line.noise == pytest.approx(0.05 / np.sqrt(8.0), rel=0.2)
 
 
+def test_a_line_over_fish_is_judged_by_the_other_lines():
+    t = np.arange(0.0, 300.0, 0.25)
+    rng, third = np.random.default_rng(3), (t // 100.0).astype(int)
+    fish = (third == 2) & (t % 100.0 > 30.0)
+    depth = 20.0 + 0.05 * rng.standard_normal(len(t)) - np.where(fish, rng.uniform(0.0, 4.0, len(t)), 0.0)
+    place = np.column_stack([t % 100.0, 30.0 * third])
+    lines = lines_of(t, np.pi * (third % 2), place, t, place, depth)
+    assert max(np.abs(line.depth - 20.0).max() for line in lines) < 0.2
+
+
 def charted(seed: int, sd: float = 0.3):
     """The chart of a bottom in cells of a metre, with an offset of 1.5 m."""
     depth, rng = terrain(seed, 0.5), np.random.default_rng([seed, 2])

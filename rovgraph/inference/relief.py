@@ -88,21 +88,32 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     straight &= at[later] - at[later - 1] < STRAIGHT_S
     p = np.stack([np.interp(t, time, axis) for axis in position.T], axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-    lines, first = [], 0
+    cells, first = [], 0
     while first < len(t):
         last = first
         while last < len(t) and straight[last] and (e[last] * np.conj(e[first])).real > BEND:
             last += 1
         if last - first > LINE_S and arc[last - 1] - arc[first] > LINE_M:
             own = slice(*np.searchsorted(at, (t[first], t[last - 1])).tolist())
-            line = _in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own])
-            lines += [line] if len(line.time) > STRETCH // 2 else []
+            if own.stop - own.start > STRETCH // 2:
+                cells.append(_in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own]))
         first = max(last, first + 1)
+    shown = [square[square > 0.0] for *_, square in cells]
+    usual = max(float(np.median(np.concatenate([*shown, [1e-9]]))), 1e-9)  # of the survey: half of a line may be fish
+    lines = []
+    for mean, count, square in cells:
+        good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * usual)
+        if good.sum() > STRETCH // 2:
+            noise, mean = float(np.sqrt((square / count)[good].mean())), mean[good]
+            along, across = np.round(mean[:, 1:3].T).astype(np.int64)
+            lines.append(Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise))
     return lines
 
 
-def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array) -> Line:
-    """Soundings of a line, averaged."""
+def _in_cells(
+    t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """Means of a line's soundings in n cells, shape (n, 6), how many there are, and their mean squared scatter."""
     way = p[-1] - p[0]
     way = way / np.linalg.norm(way)
     here = np.stack([np.interp(at, t, axis) for axis in p.T], axis=-1)
@@ -112,23 +123,16 @@ def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Ar
     cells, which, count = np.unique(np.column_stack([along, across]), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
-    mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
+    mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / count[:, None]
     scatter, spare = np.bincount(which, (depth - mean[which, 5]) ** 2), _around(cells, np.asarray(count - 1.0, float))
-    square = _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0)
-    usual = float(np.median(square[spare > 0.5])) if (spare > 0.5).any() else 0.0
-    good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
-    noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
-    mean = mean[good]
-    along, across = np.round(mean[:, 1:3].T).astype(np.int64)
-    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise)
+    square = np.where(spare > 0.5, _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0), 0.0)
+    return mean, count, square
 
 
 def _around(cells: NDArray[np.int64], values: Array) -> Array:
     """Sums over n cells, shape (n, 2), and their neighbours: beams that land astride two cells leave few in each."""
     from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
 
-    if not len(cells):
-        return values
     own = tuple((cells - cells.min(axis=0)).T)
     grid = np.zeros(np.ptp(cells, axis=0) + 1)
     grid[own] = values
