@@ -9,7 +9,7 @@ not exceed the noise is of no use.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -20,6 +20,7 @@ from rovgraph.geometry import Array
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
 SCATTER = 4.0  # sd of soundings in a cell and those beside it over what is usual, from which they are fish
+JUMP = 5.0  # depth within two cells along a line over what is usual: a rock or a wall, or fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
 STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment; longest silence
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
@@ -43,6 +44,7 @@ class Line:
     place : ndarray, shape (n, 2), north and east [m]
     depth : ndarray, shape (n,) [m]
     noise : sd of a depth by the scatter of its soundings [m]
+    jumps : ndarray of bool, shape (n,), cells where the depth jumps: rocks and walls, or the ends of a school of fish
     """
 
     time: Array
@@ -50,7 +52,8 @@ class Line:
     across: NDArray[np.int64]
     place: Array
     depth: Array
-    noise: float = 0.0
+    noise: float
+    jumps: NDArray[np.bool_]
 
     @cached_property
     def centre(self) -> tuple[Array, Array, Array]:
@@ -106,8 +109,18 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
         if good.sum() > STRETCH // 2:
             noise, mean = float(np.sqrt((square / count)[good].mean())), mean[good]
             along, across = np.round(mean[:, 1:3].T).astype(np.int64)
-            lines.append(Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise))
-    return lines
+            lines.append(Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise, along < 0))
+    rises = [_rises(line) for line in lines]
+    least = JUMP / 0.6745 * float(np.nanmedian(np.concatenate([*rises, [0.0]])))
+    return [replace(line, jumps=rise > least) for line, rise in zip(lines, rises, strict=True)]
+
+
+def _rises(line: Line) -> Array:
+    """How far the depth goes up or down within two cells of the same distance across, nan at ends [m]."""
+    rises = np.full(len(line.depth), np.nan)
+    for own in line.profiles():
+        rises[own[1:-1]] = np.abs(line.depth[own[2:]] - line.depth[own[:-2]])
+    return rises
 
 
 def _in_cells(
