@@ -22,14 +22,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import pandas as pd
 
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
 from rovgraph.inference.estimate import Estimate, calibration_estimates
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
-from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
 
@@ -214,7 +212,9 @@ def with_crossovers(
     track, used = estimate.trajectory, bottom.soundings[bottom.soundings["used"] == 1]
     soundings = (used[names].to_numpy() for names in ("time", ["north", "east"], "depth"))
     lines = lines_of(track.time, track.rpy[:, 2], track.p_n[:, :2], *soundings)
-    drift = replace(drift_of(estimate, lines), beams_sd=_beams_sd(used, track))
+    error = np.interp(used["time"], track.time, track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
+    beams = np.median(np.maximum(used["north_sd"] ** 2 + used["east_sd"] ** 2 - error, 0.0))
+    drift = replace(drift_of(estimate, lines), beams_sd=float(np.sqrt(beams / 2.0)))
     around, place = None, beliefs[CHART_PLACE]
     if chart is not None:
         drift = drift.beside(place.mean, place.sd if place.estimate or place.considered else 0.0)
@@ -241,13 +241,6 @@ def with_crossovers(
             cov_p[:, i, j] -= np.interp(track.time, left.time, np.diagonal(less[i::2, j::2]))
     corrected = replace(track, p_n=p_n, v_n=v_n, cov_p=cov_p)
     return replace(estimate, trajectory=corrected, posterior=None), found
-
-
-def _beams_sd(soundings: pd.DataFrame, track: Trajectory) -> float:
-    """Of where soundings are beside the track's error."""
-    variance = soundings["north_sd"] ** 2 + soundings["east_sd"] ** 2
-    error = np.interp(soundings["time"], track.time, track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
-    return float(np.sqrt(np.median(np.maximum(variance - error, 0.0)) / 2.0))
 
 
 def match(lines: Sequence[Line], drift: Drift, chart: DepthChart | None = None) -> Crossovers:
