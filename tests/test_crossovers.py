@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from rovgraph.dive import _Solver
 from rovgraph.errors import InputError
 from rovgraph.inference.chart import DepthChart, read_chart
-from rovgraph.inference.crossovers import Drift, LoopClosure, match
+from rovgraph.inference.crossovers import Drift, LoopClosure, crossings_of, field_at, match
 from rovgraph.inference.relief import Line, fit_relief, lines_of
 from rovgraph.model.config_sections import ChartSettings
 from rovgraph.report.assumptions import leading
@@ -46,7 +46,7 @@ def survey(seed: int, sd: float = 0.5, shift=(2.0, -1.5)):
         s = along[cells]
         place = np.column_stack([s, 20.0 + 20.0 * k + 2.5 * across] if k < 5 else [60.0 + 2.5 * across, s])
         z = depth(place) + rng.normal(0.0, 0.05, len(place))
-        lines.append(Line(200.0 * k + s, cells, across, place - (shift if k == 5 else (0.0, 0.0)), z))
+        lines.append(Line(200.0 * k + s, cells, across, place - (shift if k == 5 else (0.0, 0.0)), z, 0.0, s < 0.0))
     knots = np.arange(0.0, 1200.0, 10.0)
     late = (knots >= 1000.0).astype(float)
     P = np.kron(16.0 * np.outer(late, late), np.eye(2)) + 1e-4 * np.eye(2 * len(knots))
@@ -179,6 +179,37 @@ def test_fish_are_left_out():
     (line,) = lines_of(t, 0.0 * t, place, t, place, depth)
     assert np.abs(line.depth - 20.0).max() < 0.2
     assert line.noise == pytest.approx(0.05 / np.sqrt(8.0), rel=0.2)
+
+
+def test_a_line_over_fish_is_judged_by_the_other_lines():
+    t = np.arange(0.0, 300.0, 0.25)
+    rng, third = np.random.default_rng(3), (t // 100.0).astype(int)
+    fish = (third == 2) & (t % 100.0 > 30.0)
+    depth = 20.0 + 0.05 * rng.standard_normal(len(t)) - np.where(fish, rng.uniform(0.0, 4.0, len(t)), 0.0)
+    place = np.column_stack([t % 100.0, 30.0 * third])
+    lines = lines_of(t, np.pi * (third % 2), place, t, place, depth)
+    assert max(np.abs(line.depth - 20.0).max() for line in lines) < 0.2
+
+
+def test_a_dense_school_of_fish_ends_what_a_crossing_uses():
+    t = np.arange(0.0, 100.0)
+    rng, fish = np.random.default_rng(1), (t > 40.5) & (t < 55.5)
+    place, depth = np.column_stack([t, 0.0 * t]), 20.0 + 0.05 * rng.standard_normal(len(t)) - 1.0 * fish
+    (line,) = lines_of(t, 0.0 * t, place, t, place, depth)
+    at = line.time[line.jumps]
+    assert np.minimum(np.abs(at - 40.5), np.abs(at - 55.5)).max() < 4.5 and (at < 45.0).any() and (at > 50.0).any()
+
+    lines, drift = survey(2)
+    crossing = next(c for c in crossings_of(lines, 5, drift) if c.earlier == 2)
+    from_fish = lines[5].place[:, 1] - 1.5 - crossing.centre[1] - 4.0
+    depth, ends = lines[5].depth - 2.0 * (from_fish > 0.0), np.abs(from_fish) < 2.0
+    relief, shift = fit_relief(lines), np.array([[2.0, -1.5]])
+
+    def field(seen: Line) -> float:
+        return float(field_at([*lines[:5], seen], crossing, shift[0], 15.0, relief, None).at(shift)[0])
+
+    clean, used = field(lines[5]), field(replace(lines[5], depth=depth, jumps=ends))
+    assert clean > used > 1.0 and field(replace(lines[5], depth=depth)) < -5.0
 
 
 def charted(seed: int, sd: float = 0.3):

@@ -428,17 +428,20 @@ def field_at(
     relief: Relief,
     chart: SmoothedChart | None,
 ) -> Field | ChartField:
-    """Of soundings in reach of a crossing."""
+    """Of soundings in reach of a crossing; where the depth of one line alone jumps, nearer than that: fish."""
     if crossing.earlier == ON_CHART and chart is not None:
         line = lines[crossing.line]
         own = np.linalg.norm(line.place - crossing.centre, axis=1) < CHART_PIECE_M / 2.0
         return ChartField(line.place[own], line.depth[own], chart, relief)
-    sides = []
-    for line, moved in ((lines[crossing.line], predicted), (lines[crossing.earlier], np.zeros(2))):
+    both, cells = (lines[crossing.line], lines[crossing.earlier]), []
+    for line, moved in zip(both, (predicted, np.zeros(2)), strict=True):
         off = np.linalg.norm(line.place + moved - crossing.centre, axis=1)
-        own = np.argsort(off)[: np.clip((off < reach).sum(), LEAST_CELLS, MOST_CELLS)]
-        sides.append((line.place[own] - crossing.centre, line.depth[own]))
-    return Field(sides[0], sides[1], relief)
+        cells.append(np.argsort(off)[: np.clip((off < reach).sum(), LEAST_CELLS, MOST_CELLS)])
+    ends = [np.append(np.flatnonzero(line.jumps[own]), MOST_CELLS)[0] for line, own in zip(both, cells, strict=True)]
+    if max(ends) == MOST_CELLS:  # of rocks and walls both lines show the ends
+        cells = [own[: max(end, LEAST_CELLS)] for own, end in zip(cells, ends, strict=True)]
+    a, b = ((line.place[own] - crossing.centre, line.depth[own]) for line, own in zip(both, cells, strict=True))
+    return Field(a, b, relief)
 
 
 @dataclass(frozen=True)

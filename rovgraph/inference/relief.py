@@ -9,7 +9,7 @@ not exceed the noise is of no use.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -20,6 +20,7 @@ from rovgraph.geometry import Array
 
 CELL_M = 2.0  # of a line, along and across, within which soundings are averaged
 SCATTER = 4.0  # sd of soundings in a cell and those beside it over what is usual, from which they are fish
+JUMP = 5.0  # depth within two cells along a line over what is usual: a rock or a wall, or fish
 LINE_M, LINE_S = 20.0, 15.0  # shortest line
 STRAIGHT_S, STRAIGHT = 10.0, 0.98  # a line: mean resultant of the heading around each moment; longest silence
 BEND = np.cos(np.pi / 4.0)  # from where it began, at which a line ends
@@ -43,6 +44,7 @@ class Line:
     place : ndarray, shape (n, 2), north and east [m]
     depth : ndarray, shape (n,) [m]
     noise : sd of a depth by the scatter of its soundings [m]
+    jumps : ndarray of bool, shape (n,), cells where the depth jumps: rocks and walls, or the ends of a school of fish
     """
 
     time: Array
@@ -50,7 +52,8 @@ class Line:
     across: NDArray[np.int64]
     place: Array
     depth: Array
-    noise: float = 0.0
+    noise: float
+    jumps: NDArray[np.bool_]
 
     @cached_property
     def centre(self) -> tuple[Array, Array, Array]:
@@ -78,12 +81,23 @@ def lines_of(time: Array, heading: Array, position: Array, at: Array, place: Arr
     if len(at) < STRETCH:
         return []
     t, p, arc, parts = _straight(time, heading, position, at)
-    lines = []
+    cells = []
     for first, last in parts:
         own = slice(*np.searchsorted(at, (t[first], t[last - 1])).tolist())
-        line = _in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own])
-        lines += [line] if len(line.time) > STRETCH // 2 else []
-    return lines
+        if own.stop - own.start > STRETCH // 2:
+            cells.append(_in_cells(t[first:last], p[first:last], arc[first:last], at[own], place[own], depth[own]))
+    shown = [square[square > 0.0] for *_, square in cells]
+    usual = max(float(np.median(np.concatenate([*shown, [1e-9]]))), 1e-9)  # of the survey: half of a line may be fish
+    lines = []
+    for mean, count, square in cells:
+        good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * usual)
+        if good.sum() > STRETCH // 2:
+            noise, mean = float(np.sqrt((square / count)[good].mean())), mean[good]
+            along, across = np.round(mean[:, 1:3].T).astype(np.int64)
+            lines.append(Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise, along < 0))
+    rises = [_rises(line) for line in lines]
+    least = JUMP / 0.6745 * float(np.nanmedian(np.concatenate([*rises, [0.0]])))
+    return [replace(line, jumps=rise > least) for line, rise in zip(lines, rises, strict=True)]
 
 
 def line_ends(time: Array, heading: Array, position: Array) -> list[float]:
@@ -121,8 +135,18 @@ def _straight(
     return t, p, arc, parts
 
 
-def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array) -> Line:
-    """Soundings of a line, averaged."""
+def _rises(line: Line) -> Array:
+    """How far the depth goes up or down within two cells of the same distance across, nan at ends [m]."""
+    rises = np.full(len(line.depth), np.nan)
+    for own in line.profiles():
+        rises[own[1:-1]] = np.abs(line.depth[own[2:]] - line.depth[own[:-2]])
+    return rises
+
+
+def _in_cells(
+    t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Array
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """Means of a line's soundings in n cells, shape (n, 6), how many there are, and their mean squared scatter."""
     way = p[-1] - p[0]
     way = way / np.linalg.norm(way)
     here = np.stack([np.interp(at, t, axis) for axis in p.T], axis=-1)
@@ -132,23 +156,16 @@ def _in_cells(t: Array, p: Array, arc: Array, at: Array, place: Array, depth: Ar
     cells, which, count = np.unique(np.column_stack([along, across]), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
     columns = np.column_stack([at, along, across, place, depth])
-    mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / np.maximum(count, 1)[:, None]
+    mean = np.stack([np.bincount(which, c, len(count)) for c in columns.T], axis=-1) / count[:, None]
     scatter, spare = np.bincount(which, (depth - mean[which, 5]) ** 2), _around(cells, np.asarray(count - 1.0, float))
-    square = _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0)
-    usual = float(np.median(square[spare > 0.5])) if (spare > 0.5).any() else 0.0
-    good = (count >= 0.25 * np.median(count)) & (square <= SCATTER**2 * max(usual, 1e-9)) if len(count) else count > 0
-    noise = float(np.sqrt((square / np.maximum(count, 1))[good].mean())) if good.any() else 0.0
-    mean = mean[good]
-    along, across = np.round(mean[:, 1:3].T).astype(np.int64)
-    return Line(mean[:, 0], along, across, mean[:, 3:5], mean[:, 5], noise)
+    square = np.where(spare > 0.5, _around(cells, np.asarray(scatter, float)) / np.maximum(spare, 1.0), 0.0)
+    return mean, count, square
 
 
 def _around(cells: NDArray[np.int64], values: Array) -> Array:
     """Sums over n cells, shape (n, 2), and their neighbours: beams that land astride two cells leave few in each."""
     from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
 
-    if not len(cells):
-        return values
     own = tuple((cells - cells.min(axis=0)).T)
     grid = np.zeros(np.ptp(cells, axis=0) + 1)
     grid[own] = values
