@@ -358,7 +358,7 @@ class ChainOptimum:
 
         Parameters
         ----------
-        root : of `eliminated`, if at hand
+        root : of `eliminated`; None = the newest keyframe alone, which needs none
         """
         return P
 

@@ -21,7 +21,8 @@ from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.model.state import State
 from rovgraph.problem.problem import Index
 
-TOGETHER = 16  # columns of V, of 2 kB each per keyframe
+TOGETHER = 16  # columns of V at a time, 2 kB a keyframe
+PART = 1024  # keyframes whose V V' are calculated at a time
 
 
 @dataclass(eq=False, kw_only=True)
@@ -56,9 +57,7 @@ class ClosedChain(ChainOptimum):
         none, known = ChainStep(np.empty((0, 0)), np.empty(0)), (best.chain, best.solution, best.begun)
         own = ClosedChain(*known, keyframes=keyframes, root=root, noise=noise, step=none)
         own.wide = best.wide
-        ((x, y),) = own._covariances_with(pull[:, None])
-        y[len(y) - len(own.believed) :] = 0.0
-        own.step = ChainStep(x[..., 0].copy(), y[:, 0])
+        own.step, own._less = own._solved(pull)
         return own
 
     @cached_property
@@ -91,29 +90,37 @@ class ClosedChain(ChainOptimum):
         out[:, 3:6, 3:6] = transpose(turned)
         return out
 
-    def _marginals(self) -> tuple[Array, Array]:
-        less, less_y = np.zeros((*self.step.x.shape, self.step.x.shape[1])), np.zeros((len(self.step.y),) * 2)
-        for x, y in self._covariances_with(self.root):
-            less += x @ transpose(x)
-            less_y += y @ y.T
-        P, P_y = super()._marginals()
-        P -= less
-        del less
-        turn = self._about_state(slice(None))
-        return turn @ P @ transpose(turn), self._lessened(P_y, less_y)
-
-    def newest_covariance(self, places: Sequence[int] = ()) -> Array:
-        """As `rovgraph.inference.optimum.Optimum`."""
-        return self._newest
-
     @cached_property
-    def _newest(self) -> Array:
-        return super().newest_covariance()
+    def _less(self) -> tuple[Array, Array]:
+        """V V' of each keyframe, shape (n, d, d), and V of the newest keyframe and the border."""
+        return self._solved(np.zeros(len(self.root)))[1]
+
+    def _solved(self, pull: Array) -> tuple[ChainStep, tuple[Array, Array]]:
+        """`step` and `_less`, in one pass."""
+        V: list[Array] = []
+        for x, y in self._covariances_with(np.column_stack([pull, self.root])):
+            if not V:
+                y[len(y) - len(self.believed) :, 0] = 0.0
+                step, less = ChainStep(x[..., 0].copy(), y[:, 0].copy()), np.zeros((*x.shape[:2], x.shape[1]))
+                x[..., 0], y[:, 0] = 0.0, 0.0
+            for own in (slice(begin, begin + PART) for begin in range(0, len(x), PART)):
+                less[own] += x[own] @ transpose(x[own])
+            V.append(np.vstack([x[-1], y]))
+        return step, (less, np.hstack(V))
+
+    def _marginals(self) -> tuple[Array, Array]:
+        (P, P_y), (less, V), turn = super()._marginals(), self._less, self._about_state(slice(None))
+        P -= less
+        of_border = V[P.shape[1] :]
+        return turn @ P @ transpose(turn), self._lessened(P_y, of_border @ of_border.T)
 
     def given(self, P: Array, keyframes: Sequence[int], root: SquareRoot | None = None) -> Array:
         """As `ChainOptimum`."""
-        parts = self._covariances_with(self.root, root)
-        V = np.hstack([np.vstack([x[keyframes].reshape(-1, x.shape[2]), y]) for x, y in parts])
+        if root is None:
+            V = self._less[1]
+        else:
+            parts = self._covariances_with(self.root, root)
+            V = np.hstack([np.vstack([x[keyframes].reshape(-1, x.shape[2]), y]) for x, y in parts])
         turn, d = np.eye(len(P)), self.step.x.shape[1]
         for a, own in enumerate(self._about_state(keyframes)):
             turn[a * d : (a + 1) * d, a * d : (a + 1) * d] = own
