@@ -247,6 +247,8 @@ def with_crossovers(
 def closed(posterior: Posterior, drift: Drift, closures: Sequence[LoopClosure]) -> tuple[ClosedChain, Drift]:
     """A smoothed dive given loop closures, and what is left of its drift at the keyframes about their times.
 
+    The second-order part of heading errors is no part of the chain. It follows from the covariance after the closures.
+
     Parameters
     ----------
     posterior : of the dive
