@@ -22,8 +22,6 @@ from fault_campaign.vehicle import Compass, configuration, make_vehicle
 from live import message
 
 import rovgraph as rg
-from rovgraph.inference.crossovers import Drift, LoopClosure
-from rovgraph.inference.error_state import newest_known
 from rovgraph.inference.filter import FilterEngine
 from rovgraph.inference.initialise import initialise
 from rovgraph.inference.posterior import Posterior
@@ -92,27 +90,6 @@ def solved():
     initial = initialise(case.log, case.config)
     best = assemble(case.log, initial).optimum()
     return initial, best, Posterior.of(best, initial)
-
-
-def test_the_newest_keyframe_is_conditioned_as_the_drift_there_is():
-    initial, best, posterior = solved()
-    assert best.unknowns.considered
-    knots = np.append(np.arange(0, len(best.problem) - 1, 20), len(best.problem) - 1)
-    drift = Drift(best.problem.time[knots], np.zeros(2 * len(knots)), posterior.horizontal(knots.tolist()))
-    C = posterior.horizontal_with_newest(knots.tolist())
-    R_nb, engine = best.state.R_nb[-1], FilterEngine(initial)
-    assert np.allclose(R_nb[:2] @ C[3:6], drift.P[-2:], rtol=1e-6, atol=1e-12)
-    assert np.allclose(posterior.horizontal_with_newest(knots[:-1].tolist()), C[:, :-2])
-    ends = (float(drift.time[-1]), float(drift.time[1])), (float(drift.time[-3]), float(drift.time[2]))
-    closures = [LoopClosure(times, np.diag([400.0, 100.0]), np.array([40.0, -30.0])) for times in ends]
-    left = drift.given(closures)
-    before, after = newest_known(engine, best), newest_known(engine, best, drift.shows(closures, C))
-    assert np.allclose((after.x - before.x)[9:11], left.mean[-2:], rtol=1e-6)
-    moved = after.x[:9].reshape(3, 3)[:2]
-    assert np.allclose(moved @ after.covariance[3:6, 3:6] @ moved.T, left.P[-2:, -2:], rtol=1e-3)
-    assert np.linalg.eigvalsh(after.P).min() > -1e-12 and np.array_equal(after.L, before.L)
-    assert np.linalg.norm(left.mean[-2:]) > 1e-3
-    assert after.covariance[2, 2] < before.covariance[2, 2]  # the heading that turned the track is better known, too
 
 
 def test_a_dive_that_is_not_trusted_is_not_smoothed_for_a_match():

@@ -176,6 +176,20 @@ class SquareRoot:
             P += gain @ believed @ gain.T
         return P
 
+    def covariance_with(self, P_y: Array, x: Array) -> Array:
+        """Covariance of the border with m combinations of keyframes, shape (c, m); that of the keyframes in place of x.
+
+        Parameters
+        ----------
+        P_y : ndarray, shape (c, c), of the border
+        x : ndarray, shape (n, d, m), the combinations
+        """
+        y = np.zeros((len(P_y), x.shape[2]))
+        chain_posterior.forward_substitute(self.conditionals, x, y)
+        y = np.ascontiguousarray(P_y @ y)
+        chain_posterior.back_substitute(self.conditionals, y, x)
+        return y
+
     def covariances(self, P_y: Array) -> Array:
         """Marginal covariances of the keyframes, shape (n, d, d).
 

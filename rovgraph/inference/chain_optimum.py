@@ -10,7 +10,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.inference import gauss_newton
@@ -211,7 +210,7 @@ class ChainOptimum:
     @property
     def linearised_at(self) -> State:
         """Where all factors are linearised."""
-        return self.state if self.begun is None else self.begun
+        return self.solution.point if self.begun is None else self.begun
 
     def eliminated(self) -> SquareRoot:
         """All factors linearised and eliminated, what is considered last in the border; errors count from `state`.
@@ -336,24 +335,37 @@ class ChainOptimum:
 
     def covariances(self) -> dict[str, Array]:
         """As `rovgraph.inference.optimum.Optimum`."""
-        root, P_y = self.eliminated(), self._end.border_covariance(self.believed)
-        P = root.covariances(P_y) if len(self.problem) <= SHORT else root.turn_into_covariances(P_y)
+        P, P_y = self._marginals()
         out = {name: P[:, own, own] for name, own in COLUMNS.items()} | {MOTION_STATE: P[:, :MOTION, :MOTION]}
         for name, (border, own) in self.wide.layout.places.items():
             out[name] = np.broadcast_to(P_y[own, own], (len(P), *P_y[own, own].shape)) if border else P[:, own, own]
         return out
 
-    @property
-    def newest_targets(self) -> NDArray[np.int64]:
-        """Of `newest_covariance`, targets in the last keyframe and the border, as `rovgraph.kernels.chain` has them."""
-        layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
-        return np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
+    def _marginals(self) -> tuple[Array, Array]:
+        """Covariances of the keyframes, shape (n, d, d), and of the border."""
+        root, P_y = self.eliminated(), self._end.border_covariance(self.believed)
+        return (root.covariances(P_y) if len(self.problem) <= SHORT else root.turn_into_covariances(P_y)), P_y
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.inference.optimum.Optimum`."""
-        chosen = self.newest_targets
+        layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
+        chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
         newest = self._end.newest_covariance(self._end.border_covariance(self.believed))
-        return np.asarray(newest[np.ix_(chosen, chosen)])
+        return np.asarray(self.given(newest, [len(self.problem) - 1])[np.ix_(chosen, chosen)])
+
+    def given(self, P: Array, keyframes: Sequence[int], root: SquareRoot | None = None) -> Array:
+        """Joint covariance of q keyframes and the border about `state`, shape (q d + c, q d + c), from the chain's own.
+
+        Parameters
+        ----------
+        root : of `eliminated`; None = the newest keyframe alone, which needs none
+        """
+        return P
+
+    def drawn(self, x: Array, y: Array, root: SquareRoot, rng: np.random.Generator) -> Iterator[State]:
+        """States of m draws of the chain's errors, shapes (n, d, m) and (c, m)."""
+        for j in range(x.shape[2]):
+            yield self.wide.moved(self.solution.point, ChainStep(x[..., j], y[:, j]), 1.0)
 
     @cached_property
     def newest_of_known_constants(self) -> Array:

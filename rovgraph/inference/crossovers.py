@@ -27,8 +27,12 @@ import pandas as pd
 from rovgraph.geometry import Array
 from rovgraph.inference.bottom import Bottom
 from rovgraph.inference.chart import ChartField, ChartFile, DepthChart, SmoothedChart
+from rovgraph.inference.closed_chain import ClosedChain
 from rovgraph.inference.estimate import Estimate, calibration_estimates
+from rovgraph.inference.optimum import NEWEST, estimated_parts
+from rovgraph.inference.posterior import Posterior
 from rovgraph.inference.relief import CELL_M, SLOPE, Line, Relief, fit_relief, lines_of, repetition
+from rovgraph.inference.smoother import estimate_of
 from rovgraph.inference.trajectory import Trajectory
 from rovgraph.model.calibration import CHART, CHART_PLACE, Belief
 from rovgraph.model.origin import Origin
@@ -132,30 +136,31 @@ class Drift:
 
     def given(self, closures: Sequence[LoopClosure]) -> "Drift":
         """What is left of it."""
-        moved, less = self.shows(closures, self.P)
-        return replace(self, mean=self.mean + moved, P=self.P - less)
+        pull, root = self.shows(closures)
+        V = self.P @ root
+        return replace(self, mean=self.mean + self.P @ pull, P=self.P - V @ V.T)
 
-    def shows(self, closures: Sequence[LoopClosure], cross: Array) -> tuple[Array, Array]:
-        """What closures say of d other variables: by how much these move, and by how much less they vary.
+    def shows(self, closures: Sequence[LoopClosure]) -> tuple[Array, Array]:
+        """What k closures say of every variable x: it moves by cov(x, e) pull, its covariance loses V V'.
 
-        Parameters
-        ----------
-        closures : of this drift
-        cross : ndarray, shape (d, 2 m), covariance with the drift
+        With H the shifts by these errors e, and the closures' information W,
+
+            root root' = H' (W^-1 + H P H')^-1 H,   V = cov(x, e) root
 
         Returns
         -------
-        ndarrays, shapes (d,) and (d, d)
+        pull, root : ndarrays, shapes (2 m,) and (2 m, 2 k)
         """
         ends, information = [c.times for c in closures], np.zeros((2 * len(closures),) * 2)
         for k, closure in enumerate(closures):
             information[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = closure.information
         seen, H = np.linalg.inv(np.eye(len(information)) + information * self.beams(ends)), self.between(ends)
         information, pull = seen @ information, seen @ np.array([c.pull for c in closures]).ravel()
-        column = cross @ H.T
-        gain = column @ np.linalg.inv(np.eye(len(H)) + information @ H @ self.P @ H.T)
-        less = gain @ information @ column.T
-        return gain @ (pull - information @ H @ self.mean), 0.5 * (less + less.T)
+        value, axes = np.linalg.eigh(0.5 * (information + information.T))
+        known, S = axes * np.sqrt(value.clip(min=0.0)), H @ self.P @ H.T
+        root = np.linalg.inv(np.linalg.cholesky(np.eye(len(S)) + known.T @ S @ known)).T
+        off = np.linalg.solve(np.eye(len(S)) + information @ S, pull - information @ H @ self.mean)
+        return H.T @ off, H.T @ known @ root
 
 
 @dataclass(frozen=True)
@@ -216,10 +221,7 @@ def drift_of(estimate: Estimate, lines: Sequence[Line]) -> Drift:
 def with_crossovers(
     estimate: Estimate, bottom: Bottom, beliefs: Mapping[str, Belief], chart: ChartFile | None, origin: Origin
 ) -> tuple[Estimate, Crossovers]:
-    """A smoothed track corrected where its soundings show its drift, and what they showed.
-
-    The correction and what it leaves of the covariance are exact at the knots of the drift, and interpolated between
-    them. Velocities follow; attitude, calibration and their sds stay as they are.
+    """A smoothed dive corrected where its soundings show the drift of its track, and what they showed.
 
     Parameters
     ----------
@@ -228,28 +230,46 @@ def with_crossovers(
     beliefs : calibration variables, `CHART_PLACE` among them
     chart, origin : of the same bottom, and latitude and longitude of north = east = 0
     """
-    track, place = estimate.trajectory, beliefs[CHART_PLACE]
-    drift, found = matched(estimate, bottom, beliefs, chart, origin)
-    left = drift.given(found.closures) if found.closures else drift
+    place = beliefs[CHART_PLACE]
+    left, found = matched(estimate, bottom, beliefs, chart, origin)
+    if found.closures:
+        assert estimate.posterior is not None
+        best, left = closed(estimate.posterior, left, found.closures)
+        estimate = estimate_of(best, _relative_sd(best, estimate.posterior), estimate.posterior.initial)
     if chart is not None:
         shown = {CHART_PLACE: left.P[-2:, -2:]} if place.estimate else {}
         values = {CHART_PLACE: left.mean[-2:] if place.estimate else place.mean}
         rows = calibration_estimates({CHART_PLACE: place}, [CHART], values, shown)
         estimate = replace(estimate, calibration=[*estimate.calibration, *rows])
-        drift, left = (replace(d, time=d.time[:-1], mean=d.mean[:-2], P=d.P[:-2, :-2]) for d in (drift, left))
-    if not found.closures:
-        return estimate, found
-    moved, rate = left.at(track.time), np.diff(left.mean.reshape(-1, 2), axis=0) / np.diff(left.time)[:, None]
-    interval = np.clip(np.searchsorted(left.time, track.time, side="right") - 1, 0, len(rate) - 1)
-    p_n, v_n, cov_p = track.p_n.copy(), track.v_n.copy(), track.cov_p.copy()
-    p_n[:, :2] += moved
-    v_n[:, :2] += rate[interval]
-    less = drift.P - left.P
-    for i in range(2):
-        for j in range(2):
-            cov_p[:, i, j] -= np.interp(track.time, left.time, np.diagonal(less[i::2, j::2]))
-    corrected = replace(track, p_n=p_n, v_n=v_n, cov_p=cov_p)
-    return replace(estimate, trajectory=corrected, posterior=None), found
+    return estimate, found
+
+
+def closed(posterior: Posterior, drift: Drift, closures: Sequence[LoopClosure]) -> tuple[ClosedChain, Drift]:
+    """A smoothed dive given loop closures, and what is left of its drift at the keyframes about their times.
+
+    The second-order part of heading errors is no part of the chain. It follows from the covariance after the closures.
+
+    Parameters
+    ----------
+    posterior : of the dive
+    drift : of `matched`
+    """
+    ends = np.unique([c.times for c in closures])
+    after = np.searchsorted(posterior.time, ends[np.isfinite(ends)]).clip(1, len(posterior.time) - 1)
+    keyframes = np.union1d(after - 1, after)
+    P = posterior.of_chain(keyframes.tolist())
+    around = replace(drift, time=posterior.time[keyframes], mean=np.zeros(len(P)), P=P)
+    if np.isinf(drift.time[-1]):
+        around = around.beside(drift.mean[-2:], float(np.sqrt(drift.P[-1, -1])))
+    pull, root = (a[: len(P)] for a in around.shows(closures))
+    return ClosedChain.of(posterior.optimum, keyframes, P, pull, root), around.given(closures)
+
+
+def _relative_sd(best: ClosedChain, before: Posterior) -> dict[str, Array]:
+    """`Posterior.relative_sd`, of which closures leave as large a part as of the sd."""
+    part = np.sqrt(np.diag(best.newest_covariance()) / np.diag(before.optimum.newest_covariance()))[NEWEST:]
+    places = estimated_parts(best)
+    return {name: sd * part[places[name]] for name, sd in before.relative_sd.items() if name in places}
 
 
 def matched(

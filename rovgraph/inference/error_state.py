@@ -235,15 +235,13 @@ def reinitialised(engine: FilterEngine, problem: Problem, states: State) -> tupl
     return newest_known(engine, best), best
 
 
-def newest_known(engine: FilterEngine, best: Optimum, also: tuple[Array, Array] | None = None) -> Gaussian:
+def newest_known(engine: FilterEngine, best: Optimum) -> Gaussian:
     """The newest keyframe of a smoothed dive, as the filter has it.
 
     Parameters
     ----------
     engine : the filter's
     best : the dive, smoothed
-    also : ndarrays, shapes (d,) and (d, d), in the order of `Optimum.newest_covariance`: how the newest keyframe moves
-        by what its smoother does not know, and how much less it varies; considered variables stay as they are
     """
     layout = engine.layout
     names, size = (*best.unknowns.estimated, *best.unknowns.considered), layout.size
@@ -255,19 +253,13 @@ def newest_known(engine: FilterEngine, best: Optimum, also: tuple[Array, Array] 
     joint[:size, :size], joint[size + more :, size + more :] = start.P, start.L @ start.L.T
     known = np.concatenate([known + more * (known >= size), np.arange(size, size + more)])
     joint[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
-    estimated, moved = slice(0, size + more), np.zeros(len(joint))
-    if also is not None:
-        considered = joint[size + more :, size + more :].copy()
-        moved[known], less = also
-        joint[np.ix_(known, known)] -= less
-        joint[size + more :, size + more :] = considered
+    estimated = slice(0, size + more)
     L = np.asarray(np.linalg.cholesky(joint[size + more :, size + more :]), dtype=float)
     B = np.asarray(np.linalg.solve(L, joint[size + more :, estimated]).T, dtype=float)
     state = best.state.at([len(best.problem) - 1])
     calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
     newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
-    found = replace(Gaussian.of(newest, joint[estimated, estimated] - B @ B.T, places), B=B, L=L)
-    return found if also is None else engine.retract(found, moved[estimated], found.P)
+    return replace(Gaussian.of(newest, joint[estimated, estimated] - B @ B.T, places), B=B, L=L)
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:

@@ -265,7 +265,7 @@ class Estimate:
     def _known(self) -> Posterior:
         if self.posterior is None:
             why = (
-                "places or crossovers tie its keyframes in loops, or iSAM2 solved it"
+                "places tie its keyframes in loops, or iSAM2 solved it"
                 if self.kind == "smoothed"
                 else "it is no smoother's"
             )

@@ -14,7 +14,7 @@ rows of both, x_t = B_k x_k + B_{k+1} x_{k+1} + D y + noise; the rows that are l
 which the chain has already.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,15 +22,16 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, cross, exp_rotation, log_rotation, rotate, skew
 from rovgraph.inference.assumptions import rests_on_doubtful_compass
-from rovgraph.inference.chain import MOTION, ChainStep
+from rovgraph.inference.chain import MOTION
 from rovgraph.inference.chain_information import SquareRoot, solve_upper
 from rovgraph.inference.chain_optimum import ChainOptimum
+from rovgraph.inference.closed_chain import ClosedChain
 from rovgraph.kernels import chain_posterior
 from rovgraph.kernels.assembly import FIRST, LAST
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights
 from rovgraph.kernels.preintegration import SNAPSHOT, preintegrate
 from rovgraph.kernels.states import States
-from rovgraph.model.state import State
+from rovgraph.model.state import POSE, State
 from rovgraph.problem.initial_conditions import InitialConditions
 from rovgraph.problem.motion import SCALES
 from rovgraph.problem.problem import Index
@@ -139,21 +140,26 @@ class Posterior:
     Attributes
     ----------
     optimum, initial : the dive
+    relative_sd : name -> ndarray, shape (dim,), sd of the calibration as a part of the prior's, as
+        `rovgraph.inference.observability.without_what_noise_moves` has it
     displaced : ndarrays, shape (n, 2), one sd each of errors in north and east that move all keyframes together, such
         as where another explanation of the data puts them [m]
     """
 
     optimum: ChainOptimum
     initial: InitialConditions
+    relative_sd: Mapping[str, Array] = field(default_factory=dict)
     displaced: tuple[Array, ...] = ()
     _kept: ChainMarginals | None = field(default=None, repr=False)
 
     @staticmethod
-    def of(best: ChainOptimum, initial: InitialConditions) -> "Posterior":
+    def of(
+        best: ChainOptimum, initial: InitialConditions, relative_sd: Mapping[str, Array] | None = None
+    ) -> "Posterior":
         """That of an optimum, without the memory of its elimination."""
         own = replace(best, at_hand=None)
         own.wide = best.wide
-        return Posterior(own, initial)
+        return Posterior(own, initial, relative_sd or {})
 
     def also(self, displaced: Array) -> "Posterior":
         """With one more of `displaced`."""
@@ -205,7 +211,8 @@ class Posterior:
                 noise[np.ix_(rows, rows)] = Q
                 states.append(state)
         by_known = L.reshape(q * MOTION, -1)
-        P = by_known @ marginals.joint(keyframes) @ by_known.T + noise
+        joint = self.optimum.given(marginals.joint(keyframes), keyframes, marginals.root)
+        P = by_known @ joint @ by_known.T + noise
         R_nb, bias = (np.concatenate([getattr(s, name) for s in states]) for name in ("R_nb", "bias"))
         P = self._at_origin(P, times, R_nb, bias)
         P = self._displaced(P, times, R_nb)
@@ -214,7 +221,21 @@ class Posterior:
 
     def horizontal(self, keyframes: Sequence[int]) -> Array:
         """Joint covariance of the IMU's north and east at m keyframes, increasing, shape (2 m, 2 m) [m^2]."""
-        known, R_nb = self._marginals(), self.optimum.state.R_nb
+        P, best = self.of_chain(keyframes), self.optimum
+        if isinstance(best, ClosedChain):
+            every = np.union1d(keyframes, best.keyframes)
+            whole, closed = self.of_chain(every.tolist()), 2 * np.searchsorted(every, best.keyframes)
+            own = 2 * np.searchsorted(every, keyframes)
+            V = whole[np.ix_((own[:, None] + (0, 1)).ravel(), (closed[:, None] + (0, 1)).ravel())] @ best.root
+            P -= V @ V.T
+        for one in self._all_displaced():
+            u = one[np.asarray(keyframes)].ravel()
+            P += np.outer(u, u)
+        return P
+
+    def of_chain(self, keyframes: Sequence[int]) -> Array:
+        """As `horizontal`, of the chain without closures and without `displaced`."""
+        known, R_nb = self._marginals(), self.optimum.solution.point.R_nb
         H, X, gains = known._at(keyframes)
         m, rows = len(keyframes), R_nb[np.asarray(keyframes), :2]
         S = (rows @ X[:, POSITION]).reshape(2 * m, -1)
@@ -225,35 +246,14 @@ class Posterior:
             held = rows[k] @ later[POSITION]
             P[2 * k : 2 * k + 2, 2 * k :] += held
             P[2 * k + 2 :, 2 * k : 2 * k + 2] += held[:, 2:].T
-        for one in self._all_displaced(known.root):
-            u = one[np.asarray(keyframes)].ravel()
-            P += np.outer(u, u)
         return P
-
-    def horizontal_with_newest(self, keyframes: Sequence[int]) -> Array:
-        """Covariance of the newest keyframe and the calibration with the IMU's north and east at m keyframes.
-
-        Returns
-        -------
-        ndarray, shape (d, 2 m), rows in the order of `rovgraph.inference.optimum.Optimum.newest_covariance`
-        """
-        known, best, newest = self._marginals(), self.optimum, len(self.time) - 1
-        H, X, gains = known._at([*keyframes, newest] if keyframes[-1] != newest else keyframes)
-        m, held, out = len(keyframes), H[-1], []
-        for k in range(len(H) - 1, -1, -1):
-            held = held if k == len(H) - 1 else gains[k] @ held
-            if k < m:
-                rows = best.state.R_nb[keyframes[k], :2]
-                by_y = rows @ X[k, POSITION] @ known.P_y
-                out.append(np.hstack([rows @ held[POSITION] + by_y @ X[-1].T, by_y]))
-        return np.concatenate(out[::-1])[:, best.newest_targets].T
 
     def draw(self, count: int, rng: np.random.Generator) -> Iterator[tuple[State, Array]]:
         """States at the IMU from the distribution, and the displacement of their positions in n, shape (n, 3)."""
         root, wide, believed = self._marginals().root, self.optimum.wide, self._believed
         n, d, held = len(self.time), wide.layout.d, len(believed)
         free, R = len(root.border) - held, root.border
-        known = self._all_displaced(root)
+        known = self._all_displaced()
         while count > 0:
             some = min(count, max(DRAWN // n, 1))
             y = rng.standard_normal((len(R), some))
@@ -262,11 +262,11 @@ class Posterior:
                 y[:free] = solve_upper(R[:free, :free], y[:free] - R[:free, free:-1] @ y[free:])
             x = rng.standard_normal((n, d, some))
             chain_posterior.back_substitute(root.conditionals, y, x)
-            for j in range(some):
+            for state in self.optimum.drawn(x, y, root, rng):
                 moved = np.zeros((n, 3))
                 for one in known:
                     moved[:, :2] += rng.standard_normal() * one
-                yield wide.moved(self.optimum.state, ChainStep(x[..., j], y[:, j]), 1.0), moved
+                yield state, moved
             count -= some
 
     def _marginals(self) -> ChainMarginals:
@@ -381,11 +381,12 @@ class Posterior:
             P = P + np.outer(u, u)
         return P
 
-    def _all_displaced(self, root: SquareRoot) -> list[Array]:
+    def _all_displaced(self) -> list[Array]:
         """The same at all keyframes, shape (n, 2) each."""
         if not rests_on_doubtful_compass(self.initial):
             return [*self.displaced]
-        P = root.covariances(root.border_covariance(self._believed))[:, :6, :6]
+        P = self.optimum.covariances()[POSE]
+        self.optimum.at_hand = None
         R, arm = self.optimum.state.R_nb, skew(np.asarray(self.initial.config.imu.lever_arm_m))
         both = R @ (arm @ P[:, :3, :3] + P[:, 3:, :3]) @ np.swapaxes(R, 1, 2)
         return [displaced_by_heading(both[:, :2, 2]), *self.displaced]

@@ -213,7 +213,11 @@ def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
 @stage
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; variables that noise may bias and the dive does not show are held."""
-    best, relative = without_what_noise_moves(best)
+    return estimate_of(*without_what_noise_moves(best), b)
+
+
+def estimate_of(best: Optimum, relative: Mapping[str, Array], b: InitialConditions) -> Estimate:
+    """An optimum with its marginal covariances; ``relative`` is that of `without_what_noise_moves`."""
     states, problem = best.state, best.problem
     covariances = best.covariances()
     velocity = velocity_covariance(problem.keyframes, states, b, covariances[MOTION_STATE])
@@ -256,7 +260,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "held_at_prior": held,
             "considered": [name for name in best.unknowns.considered if name not in held],
         },
-        Posterior.of(best, b) if isinstance(best, ChainOptimum) else None,
+        Posterior.of(best, b, relative) if isinstance(best, ChainOptimum) else None,
         reply_frame(best.blocks.items(), b.config),
         current_frame(history, best.blocks.get(WATER_LAYER), b.config.water.knot_m),
     )

@@ -58,6 +58,38 @@ def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
                 x_out[k, i, col] = known[d + i, col] = known[i, col]
 
 
+@kernel("void(f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])")
+def forward_substitute(conditionals: Array, x_out: Array, y_out: Array) -> None:
+    """Solve R_k' u_k = x_k - S_{k-1}' u_{k-1} forwards in time, for m right-hand sides.
+
+    With `back_substitute`, the product of their covariance with combinations of the keyframes.
+
+    Parameters
+    ----------
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.elimination.eliminate`
+    x_out : shape (n, d, m), x to begin with, then u
+    y_out : shape (c, m), the sum of T_k' u_k is taken from it
+    """
+    n, d, m, c = x_out.shape[0], x_out.shape[1], x_out.shape[2], y_out.shape[0]
+    rest = np.zeros((2 * d + c, m))  # of x_k, x_{k+1}, y, in the order of the conditionals' columns
+    for k in range(n):
+        for i in range(d):
+            for col in range(m):
+                rest[i, col] = rest[d + i, col] + x_out[k, i, col]
+                rest[d + i, col] = 0.0
+        for i in range(d):
+            for col in range(m):
+                rest[i, col] /= conditionals[k, i, i]
+                x_out[k, i, col] = rest[i, col]
+            for j in range(i + 1, 2 * d + c):
+                factor = conditionals[k, i, j]
+                for col in range(m):
+                    rest[j, col] -= factor * rest[i, col]
+    for j in range(c):
+        for col in range(m):
+            y_out[j, col] += rest[2 * d + j, col]
+
+
 @helper
 def multiply_padded(A: Array, B: Array, inner: int, upper: bool, C_out: Array) -> None:
     """A B of ``inner`` columns of A; those left of the diagonal count as 0 where A is ``upper`` triangular."""

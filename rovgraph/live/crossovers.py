@@ -1,15 +1,10 @@
 """Crossovers while a dive goes on: after each line the dive so far is matched, and the filter goes on from that.
 
 When a straight line has ended, the thread that smooths the dive so far (`rovgraph.live.reinitialisations`) matches its
-soundings, as `rovgraph smooth` does of a whole dive (`rovgraph.inference.crossovers`). What the closures say of the
-newest keyframe x follows from its joint covariance C with the drift d of the track, whose covariance is P: with
-closures of H d of information W and pull w,
-
-    x <- x + C H' (I + W H P H')^-1 w
-
-of the whole state: position, and whatever of heading, biases and calibration is correlated with it. The filter goes on
-from there. Each match begins with the dive as the sensors have it, so no closure counts twice, and one that is refused
-later is taken back. What crossovers cannot see stays in the covariance.
+soundings, as `rovgraph smooth` does of a whole dive (`rovgraph.inference.crossovers`), and the filter goes on from the
+newest keyframe of the dive given the closures: position, heading, biases and calibration. Each match begins with the
+dive as the sensors have it, so no closure counts twice, and one that is refused later is taken back. What crossovers
+cannot see stays in the covariance.
 """
 
 from collections.abc import Sequence
@@ -22,7 +17,7 @@ from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.chart import ChartFile
-from rovgraph.inference.crossovers import ENOUGH, ON_CHART, Crossovers, Drift, crossings_of, lines_over, matched
+from rovgraph.inference.crossovers import ENOUGH, ON_CHART, Crossovers, Drift, closed, crossings_of, lines_over, matched
 from rovgraph.inference.error_state import newest_known
 from rovgraph.inference.estimate import Estimate, body_trajectory, calibration_estimates, residual_frame
 from rovgraph.inference.filter import FilterEngine
@@ -129,11 +124,8 @@ class Survey:
         drift, found = matched(estimate, bottom, initial.beliefs, self.chart, self.origin or (0.0, 0.0))
         if not found.closures:
             return Crossed(found.text, None, _places(found, drift), quiet=len(found.crossings) < ENOUGH)
-        knots = np.searchsorted(estimate.trajectory.time, drift.time[np.isfinite(drift.time)])
-        C = estimate.posterior.horizontal_with_newest(knots.tolist())
-        C = np.pad(C, ((0, 0), (0, len(drift.mean) - C.shape[1])))  # the place of a chart
-        best = estimate.posterior.optimum
-        known, before = newest_known(engine, best, drift.shows(found.closures, C)), newest_known(engine, best)
+        best, _ = closed(estimate.posterior, drift, found.closures)
+        known, before = newest_known(engine, best), newest_known(engine, estimate.posterior.optimum)
         moved = float(np.linalg.norm((known.x - before.x)[9:11]))
         sds = [_horizontal_sd(one) for one in (before, known)]
         text = f"{found.text}; the position moves by {moved:.1f} m, its sd goes from {sds[0]:.1f} m to {sds[1]:.1f} m"
