@@ -421,7 +421,7 @@ def test_check_finds_a_clock_and_a_sign_by_the_depth(descent):
     upwards = stream.data.copy()
     upwards[:, NAMES.index("adcp_vz")] *= -1.0
     rising = replace(log, streams={**log.streams, CELLS: replace(stream, data=upwards)})
-    assert "if it alone has the wrong sign, {adcp_vz: -m/s}" in findings(rising, config)["sign"]
+    assert "if only the vertical one is wrong, {adcp_vz: -m/s}" in findings(rising, config)["sign"]
 
 
 @pytest.fixture(scope="module")

@@ -86,8 +86,8 @@ def _beside_depth(log: Log, config: Config, velocity: Array) -> Iterator[Finding
     turned = float(np.sqrt(np.nanmean((apart[now] + 2.0 * sinking.to_numpy()) ** 2)))
     if turned < BETTER_LAG * error[now]:
         own_z = CELL_AXES[2] if np.isfinite(cells[CELL_AXES[2]]).any() else EARTH[2]
-        remedy = f"state units: {{adcp_velocity: -m/s}}, or if it alone has the wrong sign, {{{own_z}: -m/s}}"
-        yield Finding(CELLS, "warning", f"by its cells' vertical velocity it rises where the depth grows: {remedy}", "sign")
+        remedy = f"state units: {{adcp_velocity: -m/s}}, or if only the vertical one is wrong, {{{own_z}: -m/s}}"
+        yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
     elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
         text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
         yield Finding(CELLS, "warning", f"{text}: {remedy_of_lag(config, CELLS, lags[best], LAG_STEP_S)}", "lag")
