@@ -203,6 +203,16 @@ def test_ranges_in_centimetres_are_named_by_the_depth(dive):
     assert found(dive.read(mended, usbl=replies), mended, (acoustics.depths,)) == []
 
 
+@pytest.mark.parametrize("metre", [100.0, 1000.0])
+def test_ranges_beyond_reach_name_both_units_that_they_may_be_in(metre):
+    """What refuses the log named millimetres only, though centimetres are as likely."""
+    log, config = below_a_ship()
+    frame = without(log, "usbl").to_frame()
+    frame["range"] *= 2.0 * metre
+    (text,) = [f.text for f in acoustics_own(Log.from_frame(frame, config), config) if f.level == "error"]
+    assert "state units: {range: cm}" in text and "state units: {range: mm}" in text
+
+
 IN_MS = 2e3 / 1500.0  # travel time there and back of a metre [ms]
 
 

@@ -441,3 +441,13 @@ def test_a_depth_in_bar_is_named_where_the_dvl_is_away_from_it(with_imu) -> None
     in_bar = altered(log, "depth", log["depth"].data / 9.945)
     (named,) = (f for f in vertical(in_bar, config) if f.level != "ok")
     assert (named.sensor, named.kind) == ("depth", "unit") and "state units: {pressure: bar}" in named.text
+
+
+def test_noise_of_the_depth_is_no_other_unit() -> None:
+    """It lowers the slope by a tenth before the correlation is too low to tell units, which dbar would be, too."""
+    config = falcon(depth={"density_kgm3": 1027.0})
+    log = simulated(config, 200.0, seed=1).log
+    noise = np.random.default_rng(3).normal(size=log["depth"].data.shape)
+    for sd in np.linspace(0.04, 0.055, 40):  # the correlation falls below 0.95
+        noisy = altered(log, "depth", log["depth"].data + sd * noise)
+        assert not [f.text for f in vertical(noisy, config) if f.kind == "unit"]

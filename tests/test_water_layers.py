@@ -417,7 +417,11 @@ def test_check_finds_a_clock_and_a_sign_by_the_depth(descent):
     turned = stream.data.copy()
     turned[:, [NAMES.index(f"adcp_v{axis}") for axis in "xyz"]] *= -1.0
     away = replace(log, streams={**log.streams, CELLS: replace(stream, data=turned)})
-    assert "-m/s" in findings(away, config)["sign"]
+    assert "state units: {adcp_velocity: -m/s}" in findings(away, config)["sign"]
+    upwards = stream.data.copy()
+    upwards[:, NAMES.index("adcp_vz")] *= -1.0
+    rising = replace(log, streams={**log.streams, CELLS: replace(stream, data=upwards)})
+    assert "if only the vertical one is wrong, {adcp_vz: -m/s}" in findings(rising, config)["sign"]
 
 
 @pytest.fixture(scope="module")

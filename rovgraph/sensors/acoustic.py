@@ -22,6 +22,7 @@ from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, 
 from rovgraph.sensors.sound import is_in_feet, is_of_water, look_at_sound_speed
 
 FARTHEST_M = 12e3  # that the sound of a positioning system reaches
+NEAREST_M = 1.0  # that it is used at, in the median
 MOST_ELEVATION = 0.5 * np.pi + 1e-6
 
 
@@ -135,16 +136,17 @@ def is_plumb(elevation: Array) -> NDArray[np.bool_]:
 
 
 def _look_at_reach(values: Array, prefix: str) -> Iterator[Said]:
-    reach = FARTHEST_M, 2.0 * FARTHEST_M / SLOWEST_MPS
-    for k, what, column, own, others in (
-        (0, "ranges", "range", "m", {"mm": 1e-3}),
-        (1, "travel times", "travel_time", "s", {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
+    """Ranges and travel times beyond reach, with every unit in which they are within it: there may be two."""
+    for k, what, column, own, others, metre in (
+        (0, "ranges", "range", "m", {"cm": 1e-2, "mm": 1e-3}, 1.0),
+        (1, "travel times", "travel_time", "s", {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}, 2.0 / SLOWEST_MPS),
     ):
         known = values[np.isfinite(values[:, k]), k]
-        if len(known) and (median := float(np.median(known))) > reach[k]:
-            unit = next((name for name, factor in others.items() if median * factor <= reach[k]), own)
-            text = f"its {what} are {median:.4g} {own} in the median, farther than sound reaches; if they are in {unit}"
-            yield "error", f"{text}, state units: {{{prefix}{column}: {unit}}}", "unit"
+        if len(known) and (median := float(np.median(known))) > FARTHEST_M * metre:
+            fits = [unit for unit, factor in others.items() if NEAREST_M < median * factor / metre <= FARTHEST_M]
+            remedy = "; ".join(f"if they are in {u}, state units: {{{prefix}{column}: {u}}}" for u in fits)
+            text = f"its {what} are {median:.4g} {own} in the median, farther than sound reaches"
+            yield "error", f"{text}; {remedy or 'correct their unit'}", "unit"
 
 
 def _look_at_directions(values: Array, config: Config) -> Iterator[Said]:

@@ -272,26 +272,27 @@ def _depth_unit(log: Log, config: Config, pings: Stream, R_bs: Array) -> Finding
     f = fit(*_descents(log, config, pings, R_bs, as_read=True))
     if f.windows < MIN_WINDOWS or f.correlation < CLOSELY or max(f.sd_a, f.sd_b) < ENOUGH_DIVING:
         return None
-    if not (meant := _other_units(f.slope, log, config)):
+    ratio = f.sd_b / f.sd_a  # noise of the depth lowers the slope, by a tenth at this correlation
+    if not (meant := _other_units(ratio, log, config)):
         return None
-    text = f"the DVL sinks {f.slope:.3g} times as far: {meant} (correlation {f.correlation:.2f}, {f.windows} windows)"
+    text = f"the DVL sinks {ratio:.3g} times as far: {meant} (correlation {f.correlation:.2f}, {f.windows} windows)"
     return Finding("depth", "warning", text, "unit")
 
 
-def _other_units(slope: float, log: Log, config: Config) -> str:
+def _other_units(ratio: float, log: Log, config: Config) -> str:
     """Units in which numbers of a depth or a pressure sink as the DVL does, and what to state; "" = none or as read.
 
     Parameters
     ----------
-    slope : the DVL's way down for a metre of depth
+    ratio : the DVL's way down for a metre of depth
     """
 
     def fitting(quantity: str, column: str, own: float) -> list[str]:
         units, read_in = UNITS[quantity], config.units.get(column, "").removeprefix("-")
-        true = slope * units.get(read_in, 1.0) / own
+        true = ratio * units.get(read_in, 1.0) / own
         return [unit for unit, factor in units.items() if abs(np.log(factor / true)) < SAME_UNIT]
 
-    if abs(np.log(slope)) < SAME_UNIT:
+    if abs(np.log(ratio)) < SAME_UNIT:
         return ""
     if any(note.startswith(BY_PRESSURE) for note in log.notes):
         units = fitting("pressure", "pressure", 1.0)

@@ -29,7 +29,8 @@ from rovgraph.problem.layers import cells_axis, in_dvl_axes
 from rovgraph.rules import CLIPPED, SURE, remedy_of_lag
 from rovgraph.sensors import Kind
 from rovgraph.sensors.dvl import VELOCITIES
-from rovgraph.sensors.water_layer import CELLS
+from rovgraph.sensors.water_layer import CELLS, EARTH
+from rovgraph.sensors.water_layer import VELOCITIES as CELL_AXES
 
 ENOUGH = 20  # profiles
 LONGEST_LAG_S, LAG_STEP_S, SLOPE_S = 30.0, 0.5, 1.0  # of profiles against the depth, and over which it changes
@@ -84,7 +85,8 @@ def _beside_depth(log: Log, config: Config, velocity: Array) -> Iterator[Finding
     best = int(np.nanargmin(error))
     turned = float(np.sqrt(np.nanmean((apart[now] + 2.0 * sinking.to_numpy()) ** 2)))
     if turned < BETTER_LAG * error[now]:
-        remedy = "state units: {adcp_velocity: -m/s}"
+        own_z = CELL_AXES[2] if np.isfinite(cells[CELL_AXES[2]]).any() else EARTH[2]
+        remedy = f"state units: {{adcp_velocity: -m/s}}, or if only the vertical one is wrong, {{{own_z}: -m/s}}"
         yield Finding(CELLS, "warning", f"by its cells it rises where the depth grows: {remedy}", "sign")
     elif error[best] < BETTER_LAG * min(error[now], float(np.sqrt(np.mean(sinking.to_numpy() ** 2)))):
         text = f"its stamps are {lags[best]:+.1f} s late, by the vertical velocity of its cells beside the depth"
