@@ -31,7 +31,8 @@ from scipy.stats import chi2
 import rovgraph as rg
 from rovgraph.geometry import Array
 from rovgraph.inference.chart import DepthChart
-from rovgraph.inference.crossovers import BEAMS_M, Drift, field_at, match
+from rovgraph.inference.crossovers import field_at, match
+from rovgraph.inference.drift import BEAMS_M, Drift
 from rovgraph.inference.relief import Line, lines_of
 from rovgraph.lab.crosslines import COUNTS, CrosslinePlan, plan_crosslines, plan_crosslines_after
 from rovgraph.lab.plan import SensorRates

@@ -19,7 +19,8 @@ from rovgraph.geometry import log_rotation, right_jacobian
 from rovgraph.inference import posterior as posterior_of
 from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.closed_chain import ClosedChain
-from rovgraph.inference.crossovers import Drift, LoopClosure, closed, with_crossovers
+from rovgraph.inference.crossovers import closed, with_crossovers
+from rovgraph.inference.drift import Drift, LoopClosure
 from rovgraph.inference.error_state import newest_known
 from rovgraph.inference.filter import FilterEngine
 from rovgraph.inference.initialise import initialise

@@ -21,7 +21,8 @@ from fault_campaign.judge import Dive, run_command, write_dive
 from fault_campaign.vehicle import Compass, configuration, make_vehicle
 
 import rovgraph as rg
-from rovgraph.inference.crossovers import Drift, Field, crossings_of
+from rovgraph.inference.crossovers import Field, crossings_of
+from rovgraph.inference.drift import Drift
 from rovgraph.inference.relief import Relief
 from rovgraph.lab.crosslines import (
     USUAL_RELIEF,

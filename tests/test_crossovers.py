@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter
 from rovgraph.dive import _Solver
 from rovgraph.errors import InputError
 from rovgraph.inference.chart import DepthChart, read_chart
-from rovgraph.inference.crossovers import Drift, LoopClosure, crossings_of, field_at, match
+from rovgraph.inference.crossovers import crossings_of, field_at, match
+from rovgraph.inference.drift import Drift, LoopClosure
 from rovgraph.inference.relief import Line, fit_relief, lines_of
 from rovgraph.model.config_sections import ChartSettings
 from rovgraph.report.assumptions import leading

@@ -4,7 +4,7 @@ With e the error of north and east at some keyframes, closures say that every va
 
     x <- x + cov(x, e) pull,   P <- P - V V',   V = cov(x, e) root
 
-(`rovgraph.inference.crossovers.Drift.shows`). The covariances with e are solves with the chain's factor, forwards and
+(`rovgraph.inference.drift.Drift.shows`). The covariances with e are solves with the chain's factor, forwards and
 backwards in time. What is considered keeps its value and its prior, as in the filter of Schmidt.
 """
 

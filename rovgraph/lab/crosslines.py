@@ -22,14 +22,12 @@ from rovgraph.inference.crossovers import (
     FARTHEST_M,
     SIGMAS,
     Crossing,
-    Drift,
     Field,
-    LoopClosure,
-    condition,
     crossings_of,
     drift_of,
     field_at,
 )
+from rovgraph.inference.drift import Drift, LoopClosure, condition
 from rovgraph.inference.initialise import initialise
 from rovgraph.inference.relief import Line, Relief, fit_relief, lines_of
 from rovgraph.inference.smoother import assemble

@@ -17,7 +17,8 @@ from rovgraph.diagnosis.statistics import find_alarms
 from rovgraph.inference.bottom import bottom_of
 from rovgraph.inference.chain_optimum import ChainOptimum
 from rovgraph.inference.chart import ChartFile
-from rovgraph.inference.crossovers import ENOUGH, ON_CHART, Crossovers, Drift, closed, crossings_of, lines_over, matched
+from rovgraph.inference.crossovers import ENOUGH, ON_CHART, Crossovers, closed, crossings_of, lines_over, matched
+from rovgraph.inference.drift import Drift
 from rovgraph.inference.error_state import newest_known
 from rovgraph.inference.estimate import Estimate, body_trajectory, calibration_estimates, residual_frame
 from rovgraph.inference.filter import FilterEngine
