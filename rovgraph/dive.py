@@ -254,15 +254,15 @@ class _Solver:
     def result(self) -> DiveEstimates:
         """The dive, with what brings its variance, and what was found in it."""
         more: dict[str, object] = {}
-        if isinstance(self.best, ChainOptimum):
-            more["variance_sources"] = _sources_where_largest(self.estimates[0].trajectory, self.best)
         if self.found:
             more["noise_found"] = [one.as_dict() for one in self.found]
-        assumptions = [*(one.text for one in self.found), *self.initial.assumptions]
+        assumptions, found = [*(one.text for one in self.found), *self.initial.assumptions], None
         if self.initial.config.matches_bottom:
             text, found = self._cross()
             assumptions.insert(0, text)
             more |= {} if found is None else {"crossovers": found.as_dict()}
+        if isinstance(self.best, ChainOptimum) and not (found and found.closures):  # they leave other sources
+            more["variance_sources"] = _sources_where_largest(self.estimates[0].trajectory, self.best)
         return replace(self.dive(more), initial=replace(self.initial, assumptions=assumptions))
 
     def _cross(self) -> tuple[str, Crossovers | None]:

@@ -74,6 +74,8 @@ def test_the_predicted_sd_is_that_of_a_survey_with_these_crosslines(tmp_path, co
     before = plan_crosslines(size, config, SensorRates(50.0, 2.0), replace(after.relief, gain=np.inf))
     survey(tmp_path / "with", crosslines=count)
     track = rg.smooth(*read(tmp_path / "with")).smoothed
+    assert "crossovers" in track.summary
+    assert "variance_sources" not in track.summary  # they would be those of the dive before it was matched
     end = survey_motion(5, 120.0, 25.0, 0).duration
     P = track.trajectory.cov_p[track.trajectory.time < end]
     sd = np.sqrt(np.mean(P[:, 0, 0] + P[:, 1, 1]))
