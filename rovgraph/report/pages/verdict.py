@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.model.calibration import BEAM_SENSORS
 from rovgraph.report.assumptions import leading
 from rovgraph.report.pages.page import Opening, PageTable, Section
 from rovgraph.report.pages.source import DiveSource, PageTrack
@@ -294,7 +295,7 @@ def _by_direction(source: DiveSource) -> tuple[str, str]:
     known = float(main.horizontal_sd[origin])
     if known**2 > MOST * main.horizontal_sd[worst] ** 2:
         return _position_there(source, known, since)
-    if not {"dvl", "dvl_water"} & _used(source):
+    if not {"dvl", "dvl_water", *BEAM_SENSORS} & _used(source):
         return (
             f"the errors of the inertial unit, which grow fast since {since}, as no DVL was used",
             "use a DVL, or take position fixes more often",
