@@ -28,7 +28,7 @@ from rovgraph.inference.posterior import Posterior
 from rovgraph.inference.relief import line_ends
 from rovgraph.inference.smoother import assemble
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.crossovers import Crossed, LiveCrossovers, Survey
+from rovgraph.live.crossovers import LiveCrossovers, LiveMatch, LiveSurvey
 from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
@@ -78,7 +78,11 @@ def test_a_match_is_due_once_after_each_line_and_over_a_chart_along_it():
 
 def test_what_is_not_news_is_not_told_again():
     crossovers = LiveCrossovers(None)
-    refused, quiet, matched = Crossed("nothing is used: why"), Crossed("few", quiet=True), Crossed("3 of 3", object())
+    refused, quiet, matched = (
+        LiveMatch("nothing is used: why"),
+        LiveMatch("few", quiet=True),
+        LiveMatch("3 of 3", object()),
+    )
     assert [crossovers.tell(one) for one in (quiet, refused, refused)] == [None, ("unused", refused.text), None]
     assert [crossovers.tell(one)[0] for one in (matched, matched, refused)] == ["matched", "matched", "unused"]
     assert crossovers.tell(refused) is None
@@ -94,7 +98,7 @@ def solved():
 
 def test_a_dive_that_is_not_trusted_is_not_smoothed_for_a_match():
     initial, best, _ = solved()
-    survey = Survey([], None, None, "doubtful", used=False)
+    survey = LiveSurvey([], None, None, "doubtful", used=False)
     assert "verdict so far is doubtful" in survey.refused(initial, best.problem, best.state).text
     assert replace(survey, used=True).refused(initial, best.problem, best.state) is None  # what was used is taken back
     assert "doubtful" in survey.match(FilterEngine(initial), best, []).text

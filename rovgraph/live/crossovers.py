@@ -43,7 +43,7 @@ OVER_CHART_M = 200.0  # of way over a chart, after which the dive is matched bef
 
 
 @dataclass(frozen=True)
-class Crossed:
+class LiveMatch:
     """What a smoothed dive's crossovers say.
 
     Attributes
@@ -61,7 +61,7 @@ class Crossed:
 
 
 @dataclass(frozen=True)
-class Survey:
+class LiveSurvey:
     """What there is to match, beside the track, when the thread begins.
 
     Attributes
@@ -78,7 +78,7 @@ class Survey:
     verdict: Verdict
     used: bool
 
-    def refused(self, initial: InitialConditions, dive: Problem, states: State) -> Crossed | None:
+    def refused(self, initial: InitialConditions, dive: Problem, states: State) -> LiveMatch | None:
         """Why a dive so far is not worth smoothing, by its track before that; None where it is.
 
         Parameters
@@ -99,9 +99,9 @@ class Survey:
             return _refused(NO_RANGES)
         lines, still = lines_over(track, bottom), Drift(track.time[[0, -1]], np.zeros(4), np.zeros((4, 4)))
         enough = sum(len(crossings_of(lines, k, still)) for k in range(1, len(lines))) >= ENOUGH
-        return None if enough else Crossed("", quiet=True)
+        return None if enough else LiveMatch("", quiet=True)
 
-    def match(self, engine: FilterEngine, best: Optimum, shown: Sequence[Statistic]) -> Crossed:
+    def match(self, engine: FilterEngine, best: Optimum, shown: Sequence[Statistic]) -> LiveMatch:
         """Match a smoothed dive.
 
         Parameters
@@ -124,25 +124,25 @@ class Survey:
             return _refused(NO_RANGES)
         drift, found = matched(estimate, bottom, initial.beliefs, self.chart, self.origin or (0.0, 0.0))
         if not found.closures:
-            return Crossed(found.text, None, _places(found, drift), quiet=len(found.crossings) < ENOUGH)
+            return LiveMatch(found.text, None, _places(found, drift), quiet=len(found.crossings) < ENOUGH)
         best, _ = closed(estimate.posterior, drift, found.closures)
         known, before = newest_known(engine, best), newest_known(engine, estimate.posterior.optimum)
         moved = float(np.linalg.norm((known.x - before.x)[9:11]))
         sds = [_horizontal_sd(one) for one in (before, known)]
         text = f"{found.text}; the position moves by {moved:.1f} m, its sd goes from {sds[0]:.1f} m to {sds[1]:.1f} m"
-        return Crossed(text, known, _places(found, drift.given(found.closures)))
+        return LiveMatch(text, known, _places(found, drift.given(found.closures)))
 
     @property
     def _log(self) -> Log:
         return gathered(sorted(self.ranges, key=lambda m: m.time), "received")
 
 
-def _untrusted(verdict: Verdict) -> Crossed:
+def _untrusted(verdict: Verdict) -> LiveMatch:
     return _refused(f"the verdict so far is {verdict}, and they would make the track more certain of its error")
 
 
-def _refused(why: str) -> Crossed:
-    return Crossed(f"nothing is used: {why}")
+def _refused(why: str) -> LiveMatch:
+    return LiveMatch(f"nothing is used: {why}")
 
 
 NOT_COMPUTED = _refused("the smoothed dive does not determine its joint covariance")
@@ -209,12 +209,12 @@ class LiveCrossovers:
         since = max(time - RECENT_S, ends[-1] if ends else -np.inf)
         self._track = self._track[int(t.searchsorted(since)) :]
 
-    def survey(self, origin: Origin | None, verdict: Verdict) -> Survey:
+    def survey(self, origin: Origin | None, verdict: Verdict) -> LiveSurvey:
         """What there is to match so far."""
         self.due = False
-        return Survey([*self._ranges], self._chart, origin, verdict, self.used)
+        return LiveSurvey([*self._ranges], self._chart, origin, verdict, self.used)
 
-    def tell(self, crossed: Crossed) -> tuple[str, str] | None:
+    def tell(self, crossed: LiveMatch) -> tuple[str, str] | None:
         """Take what was matched; kind and text of an event, if it is news."""
         before, self.used = self.used, crossed.known is not None
         news = self.used or before or not (crossed.quiet or crossed.text in self._told)

@@ -26,7 +26,7 @@ from rovgraph.kernels.assembly import FIRST_KNOT
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.beacons import SHOWN_SD_M, UnplacedBeacons
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.crossovers import Crossed, LiveCrossovers
+from rovgraph.live.crossovers import LiveCrossovers, LiveMatch
 from rovgraph.live.intake import ANYWHERE_M, Intake, Startup, can_join, is_late, joined, origin_of, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
@@ -424,7 +424,7 @@ class Navigator:
             self._adopt(engine, self.isam2)
         return waited
 
-    def _cross(self, crossed: Crossed) -> None:
+    def _cross(self, crossed: LiveMatch) -> None:
         """Say what crossovers have shown, from which the filter goes on."""
         self._crossings = crossed.places
         if (crossovers := self._crossovers) is not None and (news := crossovers.tell(crossed)) is not None:

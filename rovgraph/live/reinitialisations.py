@@ -27,7 +27,7 @@ from rovgraph.inference.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.inference.optimum import Optimum
 from rovgraph.inference.score_test import as_chain
 from rovgraph.inference.trajectory import Trajectory
-from rovgraph.live.crossovers import NOT_COMPUTED, Crossed, LiveCrossovers, Survey
+from rovgraph.live.crossovers import NOT_COMPUTED, LiveCrossovers, LiveMatch, LiveSurvey
 from rovgraph.model.origin import Origin
 from rovgraph.model.state import BIAS, COLUMNS, VELOCITY
 from rovgraph.problem.initial_conditions import InitialConditions
@@ -36,7 +36,7 @@ from rovgraph.rules import RULES
 
 Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
 _Smoothed = tuple[Gaussian, list[Statistic], Optimum]
-_Work = tuple[Crossed | None, _Smoothed | None]
+_Work = tuple[LiveMatch | None, _Smoothed | None]
 
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 FREED = 20  # keyframes, after each new one, once no re-initialisation needs them: thousands at once take 40 ms
@@ -77,7 +77,7 @@ class Reinitialisations:
     crossovers: LiveCrossovers | None = None
     news: list[str] = field(default_factory=list)
     adopted: "Adopted | None" = None
-    crossed: Crossed | None = None
+    crossed: LiveMatch | None = None
     waited: float = 0.0
 
     def __post_init__(self) -> None:
@@ -189,7 +189,7 @@ def _smoothed(
     keyframes: Sequence[Keyframe],
     before: list[Statistic],
     dvl_contradicted: bool,
-    survey: Survey | None,
+    survey: LiveSurvey | None,
     due: bool,
 ) -> _Work:
     """The newest of some keyframes, from all data so far, and what these show.
