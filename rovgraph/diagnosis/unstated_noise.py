@@ -28,14 +28,13 @@ from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.distributions import chi_square_quantile
 from rovgraph.geometry import Array
 from rovgraph.inference.chain_optimum import ChainOptimum
-from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival, find_correlated_noise
+from rovgraph.inference.correlated_noise import LASTING, GaussMarkovError, Rival, find_correlated_noise, freedom
 from rovgraph.inference.gauss_newton import rejects
 from rovgraph.inference.rate_noise import ARM
 from rovgraph.inference.score_test import score_test
-from rovgraph.inference.water_walk import knots_walking_faster
 from rovgraph.inference.widened_chain import lasting_belief
 from rovgraph.log.units import behind, shown
-from rovgraph.model.calibration import AUTO, MOUNT, TABLE, WATER_LAYER
+from rovgraph.model.calibration import AUTO, LAYERS, MOUNT, TABLE, WATER_LAYER, Belief
 from rovgraph.model.config import Config
 from rovgraph.problem.initial_conditions import Beliefs
 from rovgraph.problem.motion import has_constant_velocity
@@ -99,6 +98,10 @@ def _is_turned(best: ChainOptimum) -> bool:
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
 ALONE = ("fix", "ahrs")  # sensors of which only a time offset can be held at a wrong value
 LARGER = 1.5  # factor of the noise that is not as stated
+WALK_STEP, WALKS = 1.5, 16  # from one walk of the current that is tried to the next, and how many at most
+CLEARLY = 10.0  # gain of log likelihood over the first walk, which is slower than believed
+TOGETHER = 1.5  # times the likeliest walk that is believed: knots walk by themselves, water over several at once
+FASTER = 1.25  # times the walk that is believed, from which on it is taken
 FAST_CURRENT = "check water.looks, and the axes and the clock of the profiles (rovgraph check)"
 ENOUGH = 50  # differences
 LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
@@ -260,6 +263,43 @@ def _restless(best: ChainOptimum) -> UnstatedNoise | None:
     )
     instead = FAST_CURRENT if walk > RULES["current walk"].doubtful else ""
     return UnstatedNoise(WATER_LAYER, "water.walk_mps", walk, cause, "the faster walk is used", Beliefs(knots), instead)
+
+
+def knots_walking_faster(best: ChainOptimum) -> dict[str, Belief]:
+    """Knots of the current with the walk that makes a dive the likeliest, where that is clearly larger than believed.
+
+    Where water changes faster than `water.walk_mps` has it, the estimate follows it and residuals look well; the track
+    is wrong all the same, and too sure. The likelihood of the dive, linear about its optimum, is that of
+    `rovgraph.inference.correlated_noise`, and needs one elimination for each walk that is tried.
+    """
+    names = [name for name in LAYERS if name in best.chain.layout.walking]
+    if not names:
+        return {}
+    log_determinant, least = best.linear
+    believed = freedom(best.chain, log_determinant) + 0.5 * least
+    losses = [_loss(best, _walking(best, names, 1.0 / WALK_STEP)), believed]
+    while losses[-1] < losses[-2] and len(losses) < WALKS:
+        losses.append(_loss(best, _walking(best, names, WALK_STEP ** (len(losses) - 1))))
+    if losses[0] - losses[-2] < CLEARLY:
+        return {}
+    slower, likeliest, faster = losses[-3:]
+    beyond = 1.0  # where the fastest that was tried is the likeliest; else of a parabola through the three
+    if faster >= likeliest:
+        beyond = 0.5 * (slower - faster) / (slower - 2.0 * likeliest + faster)
+    factor = TOGETHER * WALK_STEP ** (len(losses) - 3 + beyond)
+    return _walking(best, names, factor) if factor > FASTER else {}
+
+
+def _walking(best: ChainOptimum, names: list[str], factor: float) -> dict[str, Belief]:
+    return {name: replace(best.beliefs[name], walk=factor * best.beliefs[name].walk) for name in names}
+
+
+def _loss(best: ChainOptimum, knots: dict[str, Belief]) -> float:
+    """Minus log likelihood with other walks, up to what does not change with them."""
+    walks = {**best.unknowns.walks, **{name: belief.walk for name, belief in knots.items()}}
+    chain = replace(best.chain, beliefs={**best.beliefs, **knots}, unknowns=replace(best.unknowns, walks=walks))
+    root = chain.eliminate(best.linearised_at, best.solution.gates, diagonal=True)
+    return freedom(chain, root.log_determinant()) + 0.5 * root.left
 
 
 def noise_factor(r: Array) -> float | None:
