@@ -207,7 +207,7 @@ def test_the_filters_newest_keyframe_is_that_of_the_dive():
 def test_of_surveys_the_compass_is_better_known_and_errors_are_as_large_as_they_say():
     """Dives with a compass whose offset, which no crossing shows, and deviation are drawn as they are stated."""
     found, spreads = [], []
-    for seed in range(1004, 1010):
+    for seed in range(1000, 1010):
         made = dive(matern, seed, SMALL, 0.005)
         log, config = campaign_log(made)
         initial = initialise(log, config)
@@ -225,7 +225,6 @@ def test_of_surveys_the_compass_is_better_known_and_errors_are_as_large_as_they_
         assert (np.array(sds[1]) < 0.5 * np.array(sds[0])).all()
         values, _, _ = nees(rows, made.motion)
         found.append([values["position"], values["heading"]])
-    mean = np.mean(
-        found, axis=0
-    )  # in a dive it is almost one number: 99 % of chi-square of 12 and 6 degrees of freedom
-    assert 0.25 < mean[0] < 2.4 and 0.1 < mean[1] < 3.1
+    # in a dive it is almost one number: 99 % of chi-square of 20 and 10 degrees of freedom
+    mean = np.mean(found, axis=0)
+    assert 0.37 < mean[0] < 2.0 and 0.21 < mean[1] < 2.53
